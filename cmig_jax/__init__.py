@@ -1,0 +1,1 @@
+"""CMIGNet in JAX and Flax."""

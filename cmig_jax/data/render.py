@@ -19,13 +19,13 @@ import time
 from typing import Literal
 
 import numpy as np
+from scipy.spatial import KDTree
 
 Layout = Literal["dodecahedron", "ring", "axes"]
 
 EXTENT = 1.04
 """Half the width of the image plane: the unit ball and a margin for the splats."""
 RING_ELEVATION = math.radians(30.0)
-_LEVELS = 254  # greys of the object: 1 (farthest) to 255 (nearest)
 
 
 def render_views(
@@ -50,16 +50,16 @@ def render_views(
     points = _checked(points, fit)
     if size < 8:
         raise ValueError(f"size = {size}: expected at least 8 pixels")
-    radius = splat_radius(len(points), size) if splat is None else splat
+    radius = splat_radius(points, size) if splat is None else splat
     if radius < 0:
         raise ValueError(f"splat = {radius}: expected 0 pixels or more")
     frames = camera_frames(layout, count)
-    pad = 2 * radius  # discs of one row, column or view never reach the next
-    canvas = np.zeros((len(frames), size + pad, size + pad), np.uint8)
-    _scatter(points, frames, _antipodes(layout, count), canvas, size)
-    grow, trim = radius, max(0, radius - max(1, radius // 3))
-    grown = _disc_extremum(np.maximum, canvas, grow)
-    return np.ascontiguousarray(_disc_extremum(np.minimum, grown, trim)[:, :size, :size])
+    inside = slice(radius, radius + size)  # a border of background, so that the discs of one row or view never reach the next
+    canvas = np.zeros((len(frames), size + 2 * radius, size + 2 * radius), np.uint8)
+    _scatter(points, frames, _antipodes(layout, count), canvas, radius)
+    trim = max(0, radius - max(1, radius // 3))  # the difference keeps thin rods whole
+    grown = _disc_extremum(np.maximum, canvas, radius)
+    return np.ascontiguousarray(_disc_extremum(np.minimum, grown, trim)[:, inside, inside])
 
 
 def camera_directions(layout: Layout, count: int) -> np.ndarray:
@@ -107,17 +107,30 @@ def camera_frames(layout: Layout, count: int) -> np.ndarray:
     return frames
 
 
-def splat_radius(count: int, size: int) -> int:
-    """Return the radius, pixels, at which discs around `count` random points of a closed surface leave no hole.
+def splat_radius(points: np.ndarray, size: int) -> int:
+    """Return the radius at which discs around the points of a closed surface leave no hole in a view.
 
-    The surface is taken for the unit sphere, the largest convex one, so smaller objects are denser. Random points leave a pixel
-    uncovered with probability exp(-points per disc); the radius makes that a hundredth of a pixel per view.
+    Random points leave a pixel uncovered with probability exp(-points per disc); the radius makes that a hundredth of a pixel per
+    view. The density comes from distances to the fourth nearest neighbour.
+
+    Args:
+        points: `[P, 3]`, in the unit sphere.
+        size: height and width of a view, pixels.
+
+    Returns:
+        The radius, pixels: from 1 to an eighth of the view.
     """
+    largest = max(1, size // 8)
+    neighbour = min(4, len(points) - 1)
+    if neighbour == 0:
+        return 1
+    tree = KDTree(points, balanced_tree=False, compact_nodes=False)
+    distance, _ = tree.query(points[:: 1 + len(points) // 512], k=[neighbour + 1])
     pixels_per_unit = size / (2 * EXTENT)
-    points_per_pixel = count / (4 * math.pi * pixels_per_unit**2)
     per_disc = math.log(100 * math.pi * pixels_per_unit**2)
-    radius = math.sqrt(per_disc / (math.pi * points_per_pixel))
-    return max(1, min(math.ceil(radius - 0.5), size // 8))
+    area_per_point = math.pi * float(np.mean(distance**2)) / neighbour
+    radius = pixels_per_unit * math.sqrt(per_disc * area_per_point / math.pi)
+    return max(1, min(math.ceil(radius - 0.5), largest))
 
 
 def _checked(points: np.ndarray, fit: bool) -> np.ndarray:
@@ -140,9 +153,10 @@ def _checked(points: np.ndarray, fit: bool) -> np.ndarray:
     return points.astype(np.float32)
 
 
-def _scatter(points: np.ndarray, frames: np.ndarray, antipodes: tuple[int, ...], canvas: np.ndarray, size: int) -> None:
-    """Write the nearest grey of every pixel into `canvas [V, size + pad, size + pad]`."""
+def _scatter(points: np.ndarray, frames: np.ndarray, antipodes: tuple[int, ...], canvas: np.ndarray, border: int) -> None:
+    """Write the nearest grey of every pixel into `canvas [V, H, W]`, inside a border of background."""
     stride = canvas.shape[-1]
+    size, corner = stride - 2 * border, border * (stride + 1)
     flat = canvas.reshape(len(canvas), -1)
     scale = np.float32(size / (2 * EXTENT))
     for view, (frame, antipode) in enumerate(zip(frames.astype(np.float32), antipodes, strict=True)):
@@ -150,8 +164,8 @@ def _scatter(points: np.ndarray, frames: np.ndarray, antipodes: tuple[int, ...],
             continue
         right, up, depth = frame @ points.T
         column = np.clip((right + EXTENT) * scale, 0, size - 1).astype(np.int32)
-        row = np.clip((EXTENT - up) * scale, 0, size - 1).astype(np.int32) * stride
-        grey = (np.clip(depth, -1, 1) * (_LEVELS / 2) + (_LEVELS / 2 + 1.5)).astype(np.uint8)
+        row = np.clip((EXTENT - up) * scale, 0, size - 1).astype(np.int32) * stride + corner
+        grey = (np.clip(depth, -1, 1) * 127 + 128.5).astype(np.uint8)
         order = np.argsort(grey, kind="stable")  # radix sort; of several writes to a pixel the last, the nearest, stays
         row, column, grey = row[order], column[order], grey[order]
         flat[view][row + column] = grey
@@ -222,7 +236,7 @@ def _benchmark(seconds: float = 3.0) -> None:
             repeats += 1
         each = (time.process_time() - start) / repeats
         print(
-            f"{layout:>12} {count:2} views {size:3} px {number:5} points, splat {splat_radius(number, size)} px: "
+            f"{layout:>12} {count:2} views {size:3} px {number:5} points, splat {splat_radius(points, size)} px: "
             f"{1 / each:7.1f} objects/s/core, {1e3 * each:7.2f} ms per object, {1e3 * each / count:6.3f} ms per view"
         )
 

@@ -125,10 +125,10 @@ def splat_radius(points: np.ndarray, size: int) -> int:
     if neighbour == 0:
         return 1
     tree = KDTree(points, balanced_tree=False, compact_nodes=False)
-    distance, _ = tree.query(points[:: 1 + len(points) // 512], k=[neighbour + 1])
+    distance, _ = tree.query(points[:: 1 + len(points) // 512], k=neighbour + 1)
     pixels_per_unit = size / (2 * EXTENT)
     per_disc = math.log(100 * math.pi * pixels_per_unit**2)
-    area_per_point = math.pi * float(np.mean(distance**2)) / neighbour
+    area_per_point = math.pi * float(np.mean(distance[:, -1] ** 2)) / neighbour
     radius = pixels_per_unit * math.sqrt(per_disc * area_per_point / math.pi)
     return max(1, min(math.ceil(radius - 0.5), largest))
 

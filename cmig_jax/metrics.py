@@ -8,10 +8,11 @@ angles here are in degrees, lengths in units of the normalised object, every pos
 from __future__ import annotations
 
 import warnings
+from collections.abc import Sequence
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
-from scipy.spatial import cKDTree
+from scipy.spatial import KDTree
 from scipy.spatial.transform import Rotation
 
 RECALL_DEG = 5.0
@@ -42,8 +43,8 @@ def registration_metrics(
         ValueError: no pair, a wrong shape, or a pose that is none (not finite, or R no rotation). A broken estimate is never skipped,
             since leaving it out would flatter the method; the message names the pair.
     """
-    R_pred, t_pred = _poses(R_pred, t_pred, "predicted")
-    R_true, t_true = _poses(R_true, t_true, "true")
+    R_pred, t_pred = check_poses(R_pred, t_pred, "predicted")
+    R_true, t_true = check_poses(R_true, t_true, "true")
     if len(R_pred) != len(R_true) or len(R_pred) == 0:
         raise ValueError(f"{len(R_pred)} predicted and {len(R_true)} true poses: expected the same number, at least 1")
     angles, shifts = euler_errors(R_pred, R_true), t_pred - t_true
@@ -125,32 +126,45 @@ def closest_point_error(object_points: ArrayLike, R_pred: ArrayLike, t_pred: Arr
     points = np.asarray(object_points, np.float64)
     if points.ndim != 2 or points.shape[1] != 3 or len(points) == 0 or not np.isfinite(points).all():
         raise ValueError(f"object_points of shape {points.shape}: expected [P, 3] finite coordinates, P >= 1")
-    R_p, t_p = _poses(np.asarray(R_pred)[None], np.asarray(t_pred)[None], "predicted")
-    R_t, t_t = _poses(np.asarray(R_true)[None], np.asarray(t_true)[None], "true")
+    R_p, t_p = check_poses(np.asarray(R_pred)[None], np.asarray(t_pred)[None], "predicted")
+    R_t, t_t = check_poses(np.asarray(R_true)[None], np.asarray(t_true)[None], "true")
     # Both directions are asked of one tree: the object moved by true^-1 predicted, and by its inverse.
     R, t = R_t[0].T @ R_p[0], R_t[0].T @ (t_p[0] - t_t[0])
-    tree = cKDTree(points)
+    tree = KDTree(points)
     forward, _ = tree.query(points @ R.T + t)
     backward, _ = tree.query((points - t) @ R)
     return float((np.mean(forward) + np.mean(backward)) / 2)
+
+
+def check_poses(R: ArrayLike, t: ArrayLike, which: str, *, names: Sequence[object] | None = None) -> tuple[Floats, Floats]:
+    """Return poses as float64, or refuse them.
+
+    Args:
+        R: `[n, 3, 3]` rotations; the rounding of bfloat16 passes.
+        t: `[n, 3]` translations.
+        which: what they are, for the message.
+        names: n names of the pairs for the message; by default their positions.
+
+    Returns:
+        R and t.
+
+    Raises:
+        ValueError: a wrong shape, or a pose that is not finite or whose R is no rotation.
+    """
+    R, t = np.asarray(R, np.float64), np.asarray(t, np.float64)
+    if R.ndim != 3 or R.shape[1:] != (3, 3) or t.shape != (len(R), 3):
+        raise ValueError(f"{which} poses of shapes {R.shape} and {t.shape}: expected [n, 3, 3] and [n, 3]")
+    for i, (rotation, translation) in enumerate(zip(R, t, strict=True)):
+        finite = np.isfinite(rotation).all() and np.isfinite(translation).all()
+        if not finite or np.abs(rotation @ rotation.T - np.eye(3)).max() > 0.05 or np.linalg.det(rotation) < 0:
+            values = f"R = {rotation.tolist()}, t = {translation.tolist()}"
+            raise ValueError(
+                f"{which} pose of pair {i if names is None else names[i]}: expected a finite rotation and translation, not {values}"
+            )
+    return R, t
 
 
 def _euler_deg(R: ArrayLike) -> Floats:
     with warnings.catch_warnings():
         warnings.filterwarnings("ignore", message="Gimbal lock", category=UserWarning)
         return Rotation.from_matrix(np.asarray(R, np.float64)).as_euler("zyx", degrees=True)
-
-
-def _poses(R: ArrayLike, t: ArrayLike, which: str) -> tuple[Floats, Floats]:
-    """Check poses; the tolerance lets float32 and bfloat16 rotations pass."""
-    R, t = np.asarray(R, np.float64), np.asarray(t, np.float64)
-    if R.ndim != 3 or R.shape[1:] != (3, 3) or t.shape != (len(R), 3):
-        raise ValueError(f"{which} poses of shapes {R.shape} and {t.shape}: expected [n, 3, 3] and [n, 3]")
-    finite = np.isfinite(R).all((1, 2)) & np.isfinite(t).all(1)
-    safe = np.where(finite[:, None, None], R, np.eye(3))
-    rotation = (np.abs(safe @ safe.transpose(0, 2, 1) - np.eye(3)).max((1, 2)) < 0.05) & (np.linalg.det(safe) > 0)
-    for i in np.flatnonzero(~(finite & rotation)):
-        raise ValueError(
-            f"{which} pose of pair {i}: expected a finite rotation and translation, not R = {R[i].tolist()}, t = {t[i].tolist()}"
-        )
-    return R, t

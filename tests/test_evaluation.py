@@ -1,0 +1,135 @@
+"""The evaluation loop: what it writes, and that an interruption changes nothing."""
+
+import json
+
+import numpy as np
+import pytest
+from scipy.spatial.transform import Rotation
+
+from cmig_jax.baselines import icp_tuned, identity
+from cmig_jax.evaluation import ERRORS, METADATA, PARTIAL, RESULTS, evaluate, one_by_one
+
+
+def make_pair(i: int) -> dict[str, np.ndarray]:
+    rng = np.random.default_rng(i)
+    points = rng.normal(size=(100, 3)) * [1.0, 0.6, 0.3]
+    R, t = Rotation.from_euler("xyz", rng.uniform(0, 30, 3), degrees=True).as_matrix(), rng.uniform(-0.2, 0.2, 3)
+    return {
+        "source": points,
+        "target": (points @ R.T + t)[:90],
+        "R": R,
+        "t": t,
+        "object": points,
+        "index": np.array(i),
+        "label": np.array(i % 3),
+    }
+
+
+PAIRS = [make_pair(i) for i in range(7)]
+SETTINGS = {"command": "python evaluate.py", "config": {"seed": 0}, "chunk": 3, "progress": False}
+
+
+def truth(pairs):
+    return np.stack([pair["R"] for pair in pairs]), np.stack([pair["t"] for pair in pairs])
+
+
+class Counting:
+    """A method that counts its calls, and is interrupted at one of them."""
+
+    def __init__(self, method, interrupt_at=None):
+        self.method, self.calls, self.interrupt_at = method, 0, interrupt_at
+
+    def __call__(self, pairs):
+        self.calls += 1
+        if self.calls == self.interrupt_at:
+            raise KeyboardInterrupt
+        return self.method(pairs)
+
+
+def without_time(results):
+    return {name: {k: v for k, v in row.items() if k != "seconds_per_pair"} for name, row in results.items() if name not in METADATA}
+
+
+def test_writes_what_it_returns(tmp_path):
+    results = evaluate(PAIRS, {"identity": one_by_one(identity), "truth": truth}, tmp_path / "run", **SETTINGS)
+    assert json.loads((tmp_path / "run" / RESULTS).read_text()) == results
+    assert list(results) == ["identity", "truth", "command", "config", "versions"]
+    assert results["truth"]["rmse_r_deg"] == pytest.approx(0, abs=1e-5)
+    assert results["truth"]["recall"] == results["truth"]["recall_closest_point"] == 1
+    assert results["identity"]["rmse_r_deg"] > 5
+    assert results["identity"]["pairs"] == 7
+    assert results["identity"]["seconds_per_pair"] > 0
+    assert sorted(path.name for path in (tmp_path / "run").iterdir()) == [ERRORS, RESULTS]
+    with np.load(tmp_path / "run" / ERRORS) as errors:
+        np.testing.assert_array_equal(errors["index"], range(7))
+        np.testing.assert_array_equal(errors["label"], np.arange(7) % 3)
+        assert errors["identity/R"].shape == (7, 3, 3)
+        assert np.mean(errors["identity/closest_point"]) == pytest.approx(results["identity"]["closest_point"])
+
+
+def test_an_interrupted_run_continues_with_the_same_results(tmp_path):
+    expected = evaluate(PAIRS, {"icp": one_by_one(icp_tuned), "truth": truth}, tmp_path / "whole", **SETTINGS)
+    first = Counting(one_by_one(icp_tuned), interrupt_at=3)
+    with pytest.raises(KeyboardInterrupt):
+        evaluate(PAIRS, {"icp": first, "truth": truth}, tmp_path / "cut", **SETTINGS)
+    assert not (tmp_path / "cut" / RESULTS).exists()
+    second = Counting(one_by_one(icp_tuned))
+    results = evaluate((make_pair(i) for i in range(7)), {"icp": second, "truth": truth}, tmp_path / "cut", **SETTINGS)
+    assert second.calls == 1 + 2  # the warm-up and the two chunks that were missing
+    assert without_time(results) == without_time(expected)
+    assert not (tmp_path / "cut" / PARTIAL).exists()
+
+
+@pytest.mark.parametrize("change", ["config", "pairs"])
+def test_finished_chunks_of_other_settings_are_not_used(tmp_path, change):
+    failing = Counting(truth, interrupt_at=5)
+    with pytest.raises(KeyboardInterrupt):
+        evaluate(PAIRS, {"identity": one_by_one(identity), "other": failing}, tmp_path, **SETTINGS | {"chunk": 2})
+    pairs = [pair | {"source": pair["source"] + 0.1} for pair in PAIRS] if change == "pairs" else PAIRS
+    again = Counting(one_by_one(identity))
+    evaluate(pairs, {"identity": again}, tmp_path, **SETTINGS | {"chunk": 2} | ({"config": {"seed": 1}} if change == "config" else {}))
+    assert again.calls == 1 + 4
+
+
+def test_a_damaged_chunk_is_computed_again(tmp_path):
+    with pytest.raises(KeyboardInterrupt):
+        evaluate(PAIRS, {"truth": Counting(truth, interrupt_at=4)}, tmp_path, **SETTINGS)
+    for path in (tmp_path / PARTIAL).iterdir():
+        path.write_bytes(path.read_bytes()[:100])
+    assert evaluate(PAIRS, {"truth": truth}, tmp_path, **SETTINGS)["truth"]["recall"] == 1
+
+
+def test_pairs_without_an_object_have_no_closest_point(tmp_path):
+    pairs = [{key: pair[key] for key in ("source", "target", "R", "t")} for pair in PAIRS]
+    results = evaluate(pairs, {"truth": truth}, tmp_path, **SETTINGS)
+    assert "closest_point" not in results["truth"]
+    with np.load(tmp_path / ERRORS) as errors:
+        np.testing.assert_array_equal(errors["index"], range(7))
+        assert np.isnan(errors["truth/closest_point"]).all()
+
+
+def test_a_broken_pose_names_the_method_and_the_pair(tmp_path):
+    def broken(pairs):
+        R, t = truth(pairs)
+        t[[int(pair["index"]) == 4 for pair in pairs]] = np.nan
+        return R, t
+
+    with pytest.raises(ValueError, match=r"broken pose of pair 4.*nan"):
+        evaluate(PAIRS, {"broken": broken}, tmp_path, **SETTINGS)
+    assert not (tmp_path / RESULTS).exists()
+
+
+@pytest.mark.parametrize(
+    ("pairs", "methods", "message"),
+    [
+        ([], {"truth": truth}, "at least one"),
+        (PAIRS, {}, "at least one"),
+        (PAIRS, {"config": truth}, "no method named"),
+        ([{"source": np.zeros((3, 3))}], {"truth": truth}, "pair 0: target, R, t missing"),
+        (PAIRS, {"short": lambda pairs: truth(pairs[:2])}, "2 poses for 3 pairs"),
+    ],
+)
+def test_bad_input_is_refused(tmp_path, pairs, methods, message):
+    with pytest.raises(ValueError, match=message):
+        evaluate(pairs, methods, tmp_path, **SETTINGS)
+    assert not (tmp_path / RESULTS).exists()

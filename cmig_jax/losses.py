@@ -1,0 +1,147 @@
+"""The five losses (Sec. III-B and III-F). They read a Prediction and the Batch, never parameters."""
+
+from __future__ import annotations
+
+import jax
+import jax.numpy as jnp
+import optax
+from jax import Array
+
+from cmig_jax.config import LossConfig
+from cmig_jax.geometry.neighbors import nearest, squared_distances
+from cmig_jax.structs import Batch, Iteration, Prediction, RigidTransform
+
+
+def losses(prediction: Prediction, batch: Batch, config: LossConfig) -> dict[str, Array]:
+    """Compute every loss term that applies; their plain sum is the total (Eq. 15).
+
+    Args:
+        prediction: of a training pass.
+        batch: with the true pose.
+        config: the losses' flags.
+
+    Returns:
+        scalars: `cross_modal`, `overlap`, `mask`, then `matching_<i>` and `credibility_<i>` per iteration (the pcrnet head, which has
+        no correspondences, has `pose_<i>` instead).
+    """
+    assert batch.target_from_source is not None
+    pose = batch.target_from_source
+    terms = {}
+    if config.cross_modal != "off":
+        terms["cross_modal"] = _cross_modal(prediction, config)
+    if config.overlap == "on":
+        terms["overlap"] = _overlap(prediction, batch, config)
+    if prediction.source_scores is not None and prediction.iterations[0].match is not None:
+        terms["mask"] = mask(prediction)
+    for i, iteration in enumerate(prediction.iterations):
+        if iteration.match is None:
+            terms[f"pose_{i}"] = _pose(iteration, prediction, batch)
+        else:
+            terms[f"matching_{i}"] = matching(prediction, iteration, config)
+            terms[f"credibility_{i}"] = credibility(prediction, iteration, batch.source, pose, config)
+    return terms
+
+
+def cross_modal(points: Array, images: Array, temperature: float, include_positive: bool) -> Array:
+    """Contrast cloud vectors with image vectors over the batch (Eq. 3-6).
+
+    Args:
+        points: `[B, C]` mean of the two clouds' pooled features.
+        images: `[B, C]`.
+        temperature: tau.
+        include_positive: whether the positive stands in the denominator (NT-Xent) or not (Eq. 4, which can go below 0).
+    """
+    vectors = jnp.concatenate([points, images])
+    vectors = vectors / jnp.maximum(jnp.linalg.norm(vectors, axis=-1, keepdims=True), 1e-12)
+    similarity = jnp.matmul(vectors, vectors.T, precision=jax.lax.Precision.HIGHEST) / temperature
+    B = points.shape[0]
+    partner = jnp.roll(jnp.arange(2 * B), B)
+    positive = jnp.take_along_axis(similarity, partner[:, None], axis=1)[:, 0]
+    left_out = jnp.eye(2 * B, dtype=bool)
+    if not include_positive:
+        left_out |= jnp.roll(left_out, B, axis=1)
+    return jnp.mean(jax.nn.logsumexp(similarity, axis=1, where=~left_out) - positive)
+
+
+def overlap(f: Array, g: Array, overlaps_x: Array, overlaps_y: Array, margins: tuple[float, float], active_mean: bool) -> Array:
+    """Draw overlapping features together and push others away, for one pair (Eq. 2).
+
+    Args:
+        f, g: `[N, C]`, `[M, C]` point features.
+        overlaps_x, overlaps_y: `[N]`, `[M]` whether a point overlaps the other cloud.
+        margins: sigma_p, sigma_n.
+        active_mean: divide each sum by the pairs with a non-zero term instead of all pairs of its set.
+    """
+    distance = jnp.sqrt(squared_distances(f, g) + 1e-7)
+    positive, negative = jax.nn.relu(distance - margins[0]) ** 2, jax.nn.relu(margins[1] - distance) ** 2
+    x, y = overlaps_x[:, None], overlaps_y[None, :]
+    total = jnp.zeros((), distance.dtype)
+    for term, members in ((positive, x & y), (negative, x & ~y), (negative, ~x & y)):
+        counted = members & (term > 0) if active_mean else members
+        total += jnp.sum(jnp.where(members, term, 0)) / jnp.maximum(jnp.sum(counted), 1)
+    return total
+
+
+def mask(prediction: Prediction) -> Array:
+    """Teach scores the negative entropy of the first matching, rows for the source, columns for the target (Sec. III-F, L_MP)."""
+    assert prediction.source_scores is not None
+    assert prediction.target_scores is not None
+    match, chosen = prediction.iterations[0].match, prediction.keypoints
+    sides = ((prediction.source_scores, chosen.source_index, -1), (prediction.target_scores, chosen.target_index, -2))
+    total = jnp.zeros((), match.dtype)
+    for scores, index, axis in sides:
+        log_p = jax.nn.log_softmax(jax.lax.stop_gradient(match), axis=axis)
+        negative_entropy = jnp.sum(jnp.exp(log_p) * log_p, axis=axis)
+        total += 0.5 * jnp.mean((jnp.take_along_axis(scores, index, axis=1) - negative_entropy) ** 2)
+    return total
+
+
+def matching(prediction: Prediction, iteration: Iteration, config: LossConfig) -> Array:
+    """Likelihood of the true correspondents under the matching matrix (L_CS)."""
+    index, label = prediction.keypoints.match_index, prediction.keypoints.match_label
+    log_p = jax.nn.log_softmax(iteration.match, axis=-1)
+    chosen = jnp.take_along_axis(log_p, index[..., None], axis=-1)[..., 0]
+    count = jnp.maximum(jnp.sum(label), 1) if config.match_mean == "positive" else label.size
+    return -jnp.sum(label * chosen) / count
+
+
+def credibility(prediction: Prediction, iteration: Iteration, source: Array, pose: RigidTransform, config: LossConfig) -> Array:
+    """Binary cross entropy of the matching scores (L_MS).
+
+    Args:
+        prediction: for the keypoints.
+        iteration: whose scores.
+        source: `[B, N, 3]` the source cloud as given.
+        pose: true target_from_source.
+        config: `credibility_label`, `match_threshold`.
+    """
+    chosen = prediction.keypoints
+    if config.credibility_label == "index":
+        right = iteration.correspondence == chosen.match_index
+    else:
+        keypoints = jnp.take_along_axis(source, chosen.source_index[..., None], axis=1)
+        offset = pose.apply(keypoints) - iteration.corresponding
+        right = jnp.sum(offset**2, axis=-1) < config.match_threshold**2
+    return jnp.mean(optax.sigmoid_binary_cross_entropy(iteration.logit, right.astype(iteration.logit.dtype)))
+
+
+def _cross_modal(prediction: Prediction, config: LossConfig) -> Array:
+    points = 0.5 * (jnp.max(prediction.source_features, axis=1) + jnp.max(prediction.target_features, axis=1))
+    assert prediction.image_features is not None
+    images = jnp.mean(prediction.image_features, axis=1).astype(points.dtype)
+    return cross_modal(points, images, config.temperature, include_positive=config.cross_modal == "nt-xent")
+
+
+def _overlap(prediction: Prediction, batch: Batch, config: LossConfig) -> Array:
+    moved = batch.target_from_source.apply(batch.source)
+    overlaps_x = jax.vmap(nearest)(moved, batch.target)[1] < config.overlap_threshold
+    overlaps_y = jax.vmap(nearest)(batch.target, moved)[1] < config.overlap_threshold
+    per_pair = jax.vmap(lambda f, g, x, y: overlap(f, g, x, y, config.margins, config.overlap_mean == "active"))
+    return jnp.mean(per_pair(prediction.source_features, prediction.target_features, overlaps_x, overlaps_y))
+
+
+def _pose(iteration: Iteration, prediction: Prediction, batch: Batch) -> Array:
+    """Mean distance between the keypoints under this iteration's pose and under the true one."""
+    keypoints = jnp.take_along_axis(batch.source, prediction.keypoints.source_index[..., None], axis=1)
+    offset = iteration.step.apply(iteration.source) - batch.target_from_source.apply(keypoints)
+    return jnp.mean(jnp.sqrt(jnp.sum(offset**2, axis=-1) + 1e-12))

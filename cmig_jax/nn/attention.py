@@ -1,0 +1,91 @@
+"""The transformer of the first fusion layer (Sec. III-C), and of the released network's second.
+
+One pre-norm encoder layer and one decoder layer. `PairTransformer(query, memory)` decodes the query points with the encoded
+other set as memory. A memory of equal tokens (the image vector repeated N times, Eq. 1) gives the same result as one token:
+attention over equal values returns that value whatever the weights, so callers pass one.
+"""
+
+from __future__ import annotations
+
+import flax.linen as nn
+import jax.numpy as jnp
+from jax import Array
+
+from cmig_jax.geometry.neighbors import map_rows
+from cmig_jax.nn.mlp import MLP, Dense
+from cmig_jax.nn.norm import LayerNorm
+
+
+class PairTransformer(nn.Module):
+    """Encoder and decoder of one layer each, with a last norm each; no dropout."""
+
+    dim: int = 512
+    heads: int = 4
+    feed_forward: int = 1024
+    rows: int = 0
+    dtype: jnp.dtype | None = None
+
+    def setup(self) -> None:
+        def attention() -> Attention:
+            return Attention(self.dim, self.heads, rows=self.rows, dtype=self.dtype)
+
+        def feed_forward() -> MLP:
+            return MLP((self.feed_forward, self.dim), dtype=self.dtype)
+
+        self.encoder_attention, self.encoder_feed_forward = attention(), feed_forward()
+        self.encoder_norms = [LayerNorm() for _ in range(3)]
+        self.decoder_attention, self.decoder_cross, self.decoder_feed_forward = attention(), attention(), feed_forward()
+        self.decoder_norms = [LayerNorm() for _ in range(4)]
+
+    def __call__(self, query: Array, memory: Array) -> Array:
+        """Decode `query [B, N, C]` with `memory [B, M, C]` to `[B, N, C]`."""
+        return self.decode(query, self.encode(memory))
+
+    def encode(self, x: Array) -> Array:
+        """Encode a set `[B, N, C]`."""
+        norms = self.encoder_norms
+        y = norms[0](x)
+        x = x + self.encoder_attention(y, y)
+        x = x + self.encoder_feed_forward(norms[1](x))
+        return norms[2](x)
+
+    def decode(self, x: Array, memory: Array) -> Array:
+        """Decode a set `[B, N, C]` with an encoded one `[B, M, C]`."""
+        norms = self.decoder_norms
+        y = norms[0](x)
+        x = x + self.decoder_attention(y, y)
+        x = x + self.decoder_cross(norms[1](x), memory)
+        x = x + self.decoder_feed_forward(norms[2](x))
+        return norms[3](x)
+
+
+class Attention(nn.Module):
+    """Multi-head scaled dot-product attention with four linear layers."""
+
+    dim: int
+    heads: int
+    rows: int = 0
+    dtype: jnp.dtype | None = None
+
+    @nn.compact
+    def __call__(self, query: Array, memory: Array) -> Array:
+        """Attend from `query [B, N, C]` over `memory [B, M, C]`, to `[B, N, C]`."""
+
+        def split(x: Array, name: str) -> Array:
+            y = Dense(self.dim, dtype=self.dtype, name=name)(x)
+            return y.reshape(*y.shape[:-1], self.heads, -1).swapaxes(-2, -3)
+
+        q, k, v = split(query, "query"), split(memory, "key"), split(memory, "value")
+        attended = attend(q, k, v, self.rows).swapaxes(-2, -3)
+        return Dense(self.dim, dtype=self.dtype, name="out")(attended.reshape(*attended.shape[:-2], -1)).astype(query.dtype)
+
+
+def attend(query: Array, key: Array, value: Array, rows: int = 0) -> Array:
+    """Return `softmax(Q K^T / sqrt(C)) V` for `[..., N, C]`, `[..., M, C]`, `[..., M, C]`, in chunks of `rows` queries (0: at once)."""
+
+    def block(q: Array) -> Array:
+        scores = jnp.einsum("...nc,...mc->...nm", q, key).astype(jnp.promote_types(q.dtype, jnp.float32))
+        weights = nn.softmax(scores / query.shape[-1] ** 0.5, axis=-1).astype(value.dtype)
+        return jnp.einsum("...nm,...mc->...nc", weights, value)
+
+    return map_rows(block, query, rows)

@@ -1,0 +1,69 @@
+"""Shared multilayer perceptrons: 1x1 convolutions of the paper, applied to the channels of any array."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+import flax.linen as nn
+import jax
+import jax.numpy as jnp
+from jax import Array
+
+from cmig_jax.nn.norm import BatchNorm, channels
+
+# PyTorch's default for linear and convolution layers: uniform within 1 / sqrt(fan in).
+torch_kernel = nn.initializers.variance_scaling(1 / 3, "fan_in", "uniform")
+
+
+class Dense(nn.Module):
+    """A linear layer on the channels, computed in `dtype`."""
+
+    features: int
+    use_bias: bool = True
+    dtype: jnp.dtype | None = None
+
+    @nn.compact
+    def __call__(self, x: Array) -> Array:
+        """Map `x [..., C]` to `[..., features]`."""
+        C = x.shape[-1]
+        kernel = self.param("kernel", torch_kernel, (C, self.features))
+        dtype = self.dtype or kernel.dtype
+        y = x.astype(dtype) @ kernel.astype(dtype)
+        if not self.use_bias:
+            return y
+        bias = self.param("bias", _torch_bias(C), (self.features,))
+        return y + channels(bias.astype(dtype), y.ndim)
+
+
+def _torch_bias(fan_in: int) -> Callable[[Array, tuple[int, ...]], Array]:
+    bound = fan_in**-0.5
+    return lambda key, shape: jax.random.uniform(key, shape, minval=-bound, maxval=bound)
+
+
+class NormedMLP(nn.Module):
+    """Layers of linear (no bias), BatchNorm, ReLU, one per width."""
+
+    widths: tuple[int, ...]
+    dtype: jnp.dtype | None = None
+
+    @nn.compact
+    def __call__(self, x: Array, *, train: bool) -> Array:
+        """Map `x [..., C]` to `[..., widths[-1]]`."""
+        for i, width in enumerate(self.widths):
+            x = Dense(width, use_bias=False, dtype=self.dtype, name=f"layer_{i}")(x)
+            x = nn.relu(BatchNorm(width, name=f"norm_{i}")(x, train=train))
+        return x
+
+
+class MLP(nn.Module):
+    """Linear layers with bias and ReLU between them, none after the last."""
+
+    widths: tuple[int, ...]
+    dtype: jnp.dtype | None = None
+
+    @nn.compact
+    def __call__(self, x: Array) -> Array:
+        """Map `x [..., C]` to `[..., widths[-1]]`."""
+        for i, width in enumerate(self.widths):
+            x = Dense(width, dtype=self.dtype, name=f"layer_{i}")(nn.relu(x) if i else x)
+        return x

@@ -1,0 +1,104 @@
+"""Normalisation with PyTorch's meaning: the reference's numbers depend on which variance is stored and where epsilon stands."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import flax.linen as nn
+import jax
+import jax.numpy as jnp
+from flax import struct
+from jax import Array
+
+EPSILON = 1e-5
+MOMENTUM = 0.1
+
+
+@struct.dataclass
+class Moments:
+    """Batch statistics per channel: mean `[C]`, population variance `[C]`, and the number of values behind them."""
+
+    mean: Array
+    variance: Array
+    count: int = struct.field(pytree_node=False)
+
+
+@struct.dataclass
+class Affine:
+    """What BatchNorm does to a channel: `(x - mean) * scale + bias`, each `[C]`."""
+
+    mean: Array
+    scale: Array
+    bias: Array
+
+    def __call__(self, x: Array) -> Array:
+        """Normalise `x [..., C]`; the result has the type of `x`."""
+        mean, scale, bias = (channels(v, x.ndim) for v in (self.mean, self.scale, self.bias))
+        return ((x - mean) * scale + bias).astype(x.dtype)
+
+
+def channels(vector: Array, ndim: int) -> Array:
+    """View a vector `[C]` as `[1, ..., 1, C]`, so that it broadcasts over the channels of an array of `ndim` axes."""
+    return vector.reshape((1,) * (ndim - 1) + (-1,))
+
+
+def moments(parts: Sequence[Array]) -> Moments:
+    """Take mean and variance over everything but the channels, jointly over `parts` (each `[..., C]`), in float32 at least."""
+    wide = [part.astype(jnp.promote_types(part.dtype, jnp.float32)) for part in parts]
+    count = sum(part.size // part.shape[-1] for part in wide)
+    mean = sum(_sum(part) for part in wide) / count
+    variance = sum(_sum((part - channels(mean, part.ndim)) ** 2) for part in wide) / count
+    return Moments(mean=jnp.asarray(mean), variance=jnp.asarray(variance), count=count)
+
+
+def _sum(x: Array) -> Array:
+    return jnp.sum(x, axis=tuple(range(x.ndim - 1)))
+
+
+class BatchNorm(nn.Module):
+    """Batch normalisation over the global batch; the stored variance is the unbiased one, as in PyTorch.
+
+    `affine` gives the transform for statistics that were taken elsewhere (a layer that never makes the whole activation);
+    calling the module on `x [..., C]` takes them from `x`.
+    """
+
+    features: int
+
+    def setup(self) -> None:
+        self.scale = self.param("scale", nn.initializers.ones, (self.features,))
+        self.bias = self.param("bias", nn.initializers.zeros, (self.features,))
+        self.running_mean = self.variable("batch_stats", "mean", jnp.zeros, (self.features,))
+        self.running_variance = self.variable("batch_stats", "var", jnp.ones, (self.features,))
+
+    def __call__(self, x: Array, *, train: bool) -> Array:
+        """Normalise `x [..., C]`."""
+        return self.affine(moments([x]) if train else None)(x)
+
+    def affine(self, batch: Moments | None) -> Affine:
+        """Return the transform for these batch statistics, and record them; None takes the running ones."""
+        mean, variance = self.running_mean.value, self.running_variance.value
+        if batch is not None:
+            if not self.is_initializing():
+                unbiased = batch.variance * (batch.count / max(batch.count - 1, 1))
+                self.running_mean.value = jax.lax.stop_gradient((1 - MOMENTUM) * mean + MOMENTUM * batch.mean)
+                self.running_variance.value = jax.lax.stop_gradient((1 - MOMENTUM) * variance + MOMENTUM * unbiased)
+            mean, variance = batch.mean, batch.variance
+        return Affine(mean=mean, scale=self.scale * jax.lax.rsqrt(variance + EPSILON), bias=self.bias)
+
+
+class LayerNorm(nn.Module):
+    """Layer normalisation with the unbiased standard deviation and epsilon outside the root, as in the reference's transformer."""
+
+    epsilon: float = 1e-6
+
+    @nn.compact
+    def __call__(self, x: Array) -> Array:
+        """Normalise the channels of `x [..., C]`."""
+        scale = self.param("scale", nn.initializers.ones, (x.shape[-1],))
+        bias = self.param("bias", nn.initializers.zeros, (x.shape[-1],))
+        wide = x.astype(jnp.promote_types(x.dtype, jnp.float32))
+        centred = wide - jnp.mean(wide, axis=-1, keepdims=True)
+        variance = jnp.sum(centred**2, axis=-1, keepdims=True) / (x.shape[-1] - 1)
+        constant = variance == 0  # the root has no derivative there
+        deviation = jnp.where(constant, 0, jnp.sqrt(jnp.where(constant, 1, variance)))
+        return (channels(scale, x.ndim) * centred / (deviation + self.epsilon) + channels(bias, x.ndim)).astype(x.dtype)

@@ -1,0 +1,98 @@
+"""Image encoder: a ResNet per view, then the maximum over views (Eq. 1).
+
+The network sees ImageNet-normalised RGB, as the reference does. A depth view is one channel shown as grey, so its stem needs
+one input channel and a constant: the three normalised copies of a pixel x meet the kernel as `x sum_c(W_c / std_c)` minus the
+response to the constant image `mean_c / std_c`, which is computed once. The same numbers, a third of the stem's work.
+"""
+
+from __future__ import annotations
+
+import flax.linen as nn
+import jax
+import jax.numpy as jnp
+from jax import Array
+
+from cmig_jax.nn.norm import BatchNorm
+
+IMAGENET_MEAN = (0.485, 0.456, 0.406)
+IMAGENET_STD = (0.229, 0.224, 0.225)
+he_fan_out = nn.initializers.variance_scaling(2.0, "fan_out", "normal")
+
+
+class ViewEncoder(nn.Module):
+    """ResNet with basic blocks; (64, 128, 256, 512) channels and (2, 2, 2, 2) blocks are ResNet-18."""
+
+    widths: tuple[int, ...] = (64, 128, 256, 512)
+    blocks: tuple[int, ...] = (2, 2, 2, 2)
+    dtype: jnp.dtype | None = None
+
+    @nn.compact
+    def __call__(self, views: Array, *, train: bool) -> Array:
+        """Encode views `[..., H, W, 1]` (uint8 depth) or `[..., H, W, 3]` (normalised RGB) to `[..., widths[-1]]`."""
+        x = Stem(self.widths[0], dtype=self.dtype, name="stem")(views.reshape(-1, *views.shape[-3:]))
+        x = nn.relu(BatchNorm(self.widths[0], name="stem_norm")(x, train=train))
+        x = nn.max_pool(x, (3, 3), (2, 2), padding=((1, 1), (1, 1)))
+        for stage, (width, count) in enumerate(zip(self.widths, self.blocks, strict=True)):
+            for block in range(count):
+                stride = 2 if stage > 0 and block == 0 else 1
+                x = BasicBlock(width, stride, dtype=self.dtype, name=f"stage_{stage}_block_{block}")(x, train=train)
+        pooled = jnp.mean(x.astype(jnp.promote_types(x.dtype, jnp.float32)), axis=(1, 2))
+        return pooled.reshape(*views.shape[:-3], -1)
+
+
+class Stem(nn.Module):
+    """The 7x7 convolution of stride 2."""
+
+    features: int
+    dtype: jnp.dtype | None = None
+
+    @nn.compact
+    def __call__(self, images: Array) -> Array:
+        """Map `[B, H, W, 1]` uint8 depth or `[B, H, W, 3]` normalised RGB to `[B, H / 2, W / 2, features]`."""
+        kernel = self.param("kernel", he_fan_out, (7, 7, 3, self.features))
+        if images.shape[-1] == 3:
+            return self._convolve(images, kernel)
+        mean, std = (jnp.asarray(v, kernel.dtype)[None, None, :, None] for v in (IMAGENET_MEAN, IMAGENET_STD))
+        grey = jnp.sum(kernel / std, axis=2, keepdims=True)
+        constant = jnp.sum(kernel * mean / std, axis=2, keepdims=True)
+        response = self._convolve(jnp.ones((1, *images.shape[1:]), kernel.dtype), constant)
+        return self._convolve(images.astype(kernel.dtype) / 255, grey) - response
+
+    def _convolve(self, x: Array, kernel: Array) -> Array:
+        dtype = self.dtype or kernel.dtype
+        return jax.lax.conv_general_dilated(
+            x.astype(dtype), kernel.astype(dtype), (2, 2), ((3, 3), (3, 3)), dimension_numbers=("NHWC", "HWIO", "NHWC")
+        )
+
+
+class BasicBlock(nn.Module):
+    """Two 3x3 convolutions beside a shortcut (He et al., CVPR 2016)."""
+
+    features: int
+    stride: int
+    dtype: jnp.dtype | None = None
+
+    @nn.compact
+    def __call__(self, x: Array, *, train: bool) -> Array:
+        """Map `[B, H, W, C]` to `[B, H / stride, W / stride, features]`."""
+        shortcut = x
+        if self.stride != 1 or x.shape[-1] != self.features:
+            shortcut = self._convolution(1, self.stride, "shortcut")(x)
+            shortcut = BatchNorm(self.features, name="shortcut_norm")(shortcut, train=train)
+        y = self._convolution(3, self.stride, "conv_0")(x)
+        y = nn.relu(BatchNorm(self.features, name="norm_0")(y, train=train))
+        y = self._convolution(3, 1, "conv_1")(y)
+        return nn.relu(BatchNorm(self.features, name="norm_1")(y, train=train) + shortcut)
+
+    def _convolution(self, size: int, stride: int, name: str) -> nn.Conv:
+        pad = size // 2
+        return nn.Conv(
+            self.features,
+            (size, size),
+            (stride, stride),
+            padding=((pad, pad), (pad, pad)),
+            use_bias=False,
+            dtype=self.dtype,
+            kernel_init=he_fan_out,
+            name=name,
+        )

@@ -1,0 +1,157 @@
+"""7-Scenes (Sec. IV-D): depth frames and camera poses, fused into fragments of 50 frames, each in the frame of its first camera.
+
+Frames are `frame-XXXXXX.depth.png` (16 bit, millimetres, 0 and 65535 mean no depth) and `frame-XXXXXX.pose.txt` (`[4, 4]` world from
+camera). Fragments are in metres.
+"""
+
+from __future__ import annotations
+
+import functools
+from collections.abc import Sequence
+from pathlib import Path
+
+import numpy as np
+from PIL import Image
+
+from cmig_jax.data.geometry_files import read_geometry
+from cmig_jax.data.raw import RawDataset, RawObject, existing_folder
+
+FRAMES_PER_FRAGMENT = 50
+CELL = 0.01
+"""Edge of the cells that a fragment keeps one point of, metres; the sensor's noise at 2 m is about as large."""
+_INTRINSICS = np.array([[585.0, 0, 320], [0, 585, 240], [0, 0, 1]])
+_NO_DEPTH = (0, 65535)
+_TEST_SCENE = "office"
+
+
+def open_sevenscenes(root: str | None) -> RawDataset:
+    """Open scenes, one category each; every fragment is an object.
+
+    A scene is a sub-folder with frames in `seq-XX/` or directly, or with ready-made fragments (PLY); the root may itself be one.
+    Office is the test split, and the other scenes are the train split; without an Office the last scene by name is the test split, and a
+    root that is a single scene is all test.
+
+    Raises:
+        ValueError: no such folder, no frames or fragments in it, or a frame without a pose.
+    """
+    folder = existing_folder(root, "a folder of scenes with frame-*.depth.png and frame-*.pose.txt, or with fragment PLYs")
+    scenes = {}
+    if any(folder.glob("frame-*.depth.png")) or any(folder.glob("seq-*")) or any(folder.glob("*.ply")):
+        scenes[folder.resolve().name] = _fragments(folder)
+    else:
+        scenes = {place.name: found for place in sorted(folder.iterdir()) if place.is_dir() and (found := _fragments(place))}
+    if not any(scenes.values()):
+        raise ValueError(f"{folder}: no frame-*.depth.png and no fragment *.ply in it; expected scenes as sub-folders, or one scene")
+    office = [name for name in scenes if _TEST_SCENE in name.lower()]
+    held = office or [max(scenes)]
+    objects = [
+        RawObject(f"{scene}/{name}", label, "test" if scene in held else "train", read)
+        for label, (scene, fragments) in enumerate(scenes.items())
+        for name, read in fragments
+    ]
+    objects.sort(key=lambda item: item.split != "train")
+    return RawDataset(tuple(scenes), tuple(objects), "sevenscenes")
+
+
+def fuse_frames(depth_paths: Sequence[str | Path], intrinsics: np.ndarray = _INTRINSICS) -> np.ndarray:
+    """Fuse depth frames into one cloud in the frame of the first camera.
+
+    Args:
+        depth_paths: frames in order; the pose of each lies beside it.
+        intrinsics: `[3, 3]` pinhole matrix, pixels.
+
+    Returns:
+        `[P, 3]` float32, metres: the mean of the points in each occupied cell of edge `CELL`.
+
+    Raises:
+        ValueError: an unreadable frame or pose, or no depth at all.
+    """
+    seen, first_from_world = [np.zeros((0, 4))], None
+    for path in map(Path, depth_paths):
+        world_from_camera = _pose(path)
+        if first_from_world is None:
+            first_from_world = np.linalg.inv(world_from_camera)
+        first_from_camera = first_from_world @ world_from_camera
+        points = _back_project(_depth(path), intrinsics) @ first_from_camera[:3, :3].T + first_from_camera[:3, 3]
+        seen.append(_cells(np.concatenate([points, np.ones((len(points), 1))], -1)))
+    fused = _cells(np.concatenate(seen))
+    if len(fused) == 0:
+        raise ValueError(f"{depth_paths[0] if depth_paths else 'no frames'}: no depth in {len(depth_paths)} frames; expected some")
+    return (fused[:, :3] / fused[:, 3:]).astype(np.float32)
+
+
+def _fragments(scene: Path) -> list[tuple[str, functools.partial]]:
+    found = []
+    for place in [scene, *sorted(scene.glob("seq-*"))]:
+        frames = sorted(place.glob("frame-*.depth.png"))
+        intrinsics = _intrinsics(place) if frames else _INTRINSICS
+        for path in frames:
+            if not _pose_path(path).is_file():
+                raise ValueError(f"{_pose_path(path)}: no such file; expected the pose of {path.name}")
+        starts = list(range(0, len(frames), FRAMES_PER_FRAGMENT))
+        # A short rest at the end of a sequence sees too little of the room.
+        if len(starts) > 1 and len(frames) - starts[-1] < FRAMES_PER_FRAGMENT // 2:
+            starts.pop()
+        for number, start in enumerate(starts):
+            name = f"{place.name}/fragment-{number:03d}" if place != scene else f"fragment-{number:03d}"
+            chosen = tuple(frames[start : start + FRAMES_PER_FRAGMENT])
+            found.append((name, functools.partial(fuse_frames, chosen, intrinsics)))
+    if found:
+        return found
+    return [(path.name, functools.partial(read_geometry, path)) for path in sorted(scene.glob("*.ply"))]
+
+
+def _intrinsics(place: Path) -> np.ndarray:
+    """The nearest intrinsics file among the frames' folder and the two above it, else those of the dataset."""
+    for folder in (place, place.parent, place.parent.parent):
+        path = folder / "camera-intrinsics.txt"
+        if path.is_file():
+            return _matrix(path, 3)
+    return _INTRINSICS
+
+
+def _pose_path(depth_path: Path) -> Path:
+    return depth_path.with_name(depth_path.name.replace(".depth.png", ".pose.txt"))
+
+
+def _pose(depth_path: Path) -> np.ndarray:
+    return _matrix(_pose_path(depth_path), 4)
+
+
+def _matrix(path: Path, size: int) -> np.ndarray:
+    try:
+        matrix = np.loadtxt(path, ndmin=2)
+    except (OSError, ValueError) as error:
+        raise ValueError(f"{path}: not a readable matrix ({error}); expected {size} lines of {size} numbers") from error
+    if matrix.shape != (size, size) or not np.isfinite(matrix).all() or abs(np.linalg.det(matrix)) < 1e-6:
+        raise ValueError(f"{path}: {matrix.tolist()}; expected an invertible [{size}, {size}] matrix of finite numbers")
+    return matrix
+
+
+def _depth(path: Path) -> np.ndarray:
+    try:
+        with Image.open(path) as image:
+            depth = np.asarray(image)
+    except (OSError, SyntaxError) as error:
+        raise ValueError(f"{path}: not a readable PNG ({error}); expected 16-bit depth in millimetres") from error
+    if depth.ndim != 2 or depth.dtype.kind not in "iu" or depth.dtype.itemsize < 2:
+        raise ValueError(f"{path}: pixels of shape {depth.shape}, {depth.dtype}; expected [H, W] of 16 bits")
+    return depth
+
+
+def _back_project(depth: np.ndarray, intrinsics: np.ndarray) -> np.ndarray:
+    v, u = np.nonzero(~np.isin(depth, _NO_DEPTH))
+    z = depth[v, u] / 1000.0
+    return np.stack([(u - intrinsics[0, 2]) * z / intrinsics[0, 0], (v - intrinsics[1, 2]) * z / intrinsics[1, 1], z], -1)
+
+
+def _cells(rows: np.ndarray) -> np.ndarray:
+    """Add up rows `[P, 4]` of summed coordinates and their count that fall into the same cell.
+
+    Done frame by frame first, this bounds the memory by the surface seen and not by the pixels.
+    """
+    cells = np.floor(rows[:, :3] / rows[:, 3:] / CELL).astype(np.int64)
+    cells -= cells.min(0, initial=0)
+    extent = cells.max(0, initial=0) + 1
+    _, index = np.unique((cells[:, 0] * extent[1] + cells[:, 1]) * extent[2] + cells[:, 2], return_inverse=True)
+    return np.stack([np.bincount(index, column) for column in rows.T], -1)

@@ -124,9 +124,9 @@ def check_settings(folder: Path, config: Config) -> None:
     manifest = read_manifest(folder)
     made, wanted = manifest["settings"], settings_of(config)
     per_object = config.data.points * (2 if config.data.sampling == "twice" else 1)
-    if manifest["points"] < per_object:
+    if manifest["distinct"] < per_object:
         detail = f"data.points = {config.data.points} with data.sampling = {config.data.sampling}"
-        raise ValueError(f"{detail} needs {per_object} points per object, but {folder} was prepared with {manifest['points']}")
+        raise ValueError(f"{detail} needs {per_object} points of every object, but {folder} has objects of {manifest['distinct']}")
     names = ["data.source", "data.shapes"]
     if config.views.of == "object":
         names += ["views.of", "views.count", "views.size", "views.layout"]
@@ -186,16 +186,14 @@ def write_note(folder: Path, settings: Mapping[str, Any], shard: Mapping[str, An
         file.write(json.dumps({"format": FORMAT, "settings": settings, "shard": shard}).encode())
 
 
-def write_manifest(
-    folder: Path, settings: Mapping[str, Any], categories: Sequence[str], points: int, shards: Sequence[dict[str, Any]]
-) -> None:
+def write_manifest(folder: Path, settings: Mapping[str, Any], categories: Sequence[str], shards: Sequence[dict[str, Any]]) -> None:
     """Write the manifest, then remove the notes that it replaces and what an interruption left."""
     splits = {split: [shard for shard in shards if shard["name"].startswith(split)] for split in ("train", "test")}
     manifest = {
         "format": FORMAT,
         "settings": settings,
         "categories": list(categories),
-        "points": points,
+        "distinct": min(shard["distinct"] for shard in shards),
         "objects": {split: sum(len(shard["names"]) for shard in found) for split, found in splits.items()},
         "splits": {split: found for split, found in splits.items() if found},
     }

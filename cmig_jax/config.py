@@ -199,6 +199,8 @@ class OptimConfig:
     """Pairs per step over all devices; the last incomplete batch of an epoch is dropped."""
     clip_norm: float = 0.0
     """Largest global gradient norm; 0 is off."""
+    validate_every: int = 1
+    """Epochs between validations, each of which saves a checkpoint."""
 
 
 @dataclass(frozen=True)
@@ -282,6 +284,7 @@ def _rules(c: Config) -> list[tuple[str, bool, str]]:
             "at least 2 pairs, since the loss contrasts pairs of one batch (or loss.cross_modal = off)",
         ),
         (f"optim.epochs = {o.epochs}", o.epochs >= 1, "at least 1"),
+        (f"optim.validate_every = {o.validate_every}", o.validate_every >= 1, "at least 1"),
         (f"optim.learning_rate = {o.learning_rate}", o.learning_rate > 0, "above 0"),
         (f"compute.rows = {c.compute.rows}", c.compute.rows >= 0, "0 (whole) or a chunk size"),
     ]

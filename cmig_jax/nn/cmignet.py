@@ -153,9 +153,7 @@ class CMIGNet(nn.Module):
 
     def _training_keypoints(self, batch: Batch, key: Array | None, source_index: Array | None) -> Keypoints:
         assert batch.target_from_source is not None
-        correspondent, label = true_correspondents(
-            batch.source, batch.target, batch.target_from_source, self.match_threshold, self.rows
-        )
+        correspondent, label = true_correspondents(batch.source, batch.target, batch.target_from_source, self.match_threshold, self.rows)
         if self.select == "all":
             every = self._keypoints(batch, None, None, None)
             return every.replace(match_index=correspondent, match_label=label)

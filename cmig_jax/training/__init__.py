@@ -1,0 +1,1 @@
+"""Training: the only room where data, network and losses meet."""

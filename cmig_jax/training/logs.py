@@ -1,0 +1,57 @@
+"""What a run says while it trains: a progress bar, `log.jsonl`, TensorBoard files."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Mapping
+from pathlib import Path
+from types import TracebackType
+
+from tensorboardX import SummaryWriter
+from tqdm import tqdm
+
+from cmig_jax.training.checkpoint import write_atomically
+
+
+class Log:
+    """Logs of a run that stands at `step` of `total`; lines of later steps, which a continued run will write again, are dropped."""
+
+    def __init__(self, run: Path, step: int, total: int, *, progress: bool) -> None:
+        self.path = run / "log.jsonl"
+        lines = self.path.read_text().splitlines() if self.path.exists() else []
+        kept = [line for line in lines if _step(line) is not None and _step(line) <= step]  # type: ignore[operator]
+        write_atomically(self.path, "".join(line + "\n" for line in kept))
+        self._writer = SummaryWriter(str(run / "tensorboard"), purge_step=step + 1)
+        self._bar = tqdm(total=total, initial=step, unit="step", disable=not progress, smoothing=0.05, dynamic_ncols=True)
+
+    def advance(self, loss: float | None) -> None:
+        """Move the bar by one step."""
+        if loss is not None:
+            self._bar.set_postfix(loss=f"{loss:.3f}", refresh=False)
+        self._bar.update(1)
+
+    def write(self, step: int, values: Mapping[str, float]) -> None:
+        """Record scalars of a step."""
+        with self.path.open("a") as file:
+            file.write(json.dumps({"step": step, **values}) + "\n")
+        for name, value in values.items():
+            self._writer.add_scalar(name, value, step)
+
+    def say(self, text: str) -> None:
+        """Print a line above the bar."""
+        tqdm.write(text)
+
+    def __enter__(self) -> Log:
+        return self
+
+    def __exit__(self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None) -> None:
+        self._writer.close()
+        self._bar.close()
+
+
+def _step(line: str) -> int | None:
+    """Read the step of a log line; None for one that was cut off."""
+    try:
+        return int(json.loads(line)["step"])
+    except (ValueError, KeyError, TypeError):
+        return None

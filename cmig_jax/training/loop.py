@@ -1,0 +1,201 @@
+"""A training run from start, or from where it stopped, to its end."""
+
+from __future__ import annotations
+
+import signal
+import threading
+import time
+from collections.abc import Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass
+from pathlib import Path
+from types import FrameType
+
+import jax
+import numpy as np
+from jax.sharding import Mesh
+
+from cmig_jax.config import Config
+from cmig_jax.data.loader import BatchIterator, epoch_steps, training_batches
+from cmig_jax.data.pairs import Pair, Pairs, in_categories, split_validation
+from cmig_jax.data.prepare import ensure_prepared
+from cmig_jax.data.shards import Shards, check_settings
+from cmig_jax.metrics import registration_metrics
+from cmig_jax.nn.build import build, uses_images
+from cmig_jax.training.checkpoint import MEASURE, Checkpoints, write_config
+from cmig_jax.training.logs import Log
+from cmig_jax.training.mesh import device_mesh, to_device
+from cmig_jax.training.optim import optimizer, schedule
+from cmig_jax.training.predict import Predictor
+from cmig_jax.training.state import Step, TrainState, abstract_state, create_state, make_step
+
+LOG_EVERY = 10  # steps
+
+
+class Interrupted(Exception):
+    """The run was asked to stop; it is saved and can be continued."""
+
+
+class NonFiniteLoss(Exception):
+    """A loss or gradient is not finite; the batch is saved."""
+
+
+@dataclass(frozen=True)
+class TrainingData:
+    """Pairs to train on (drawn anew each epoch) and to validate on (fixed)."""
+
+    train: Pairs
+    validation: Pairs
+
+
+def train(config: Config, run: Path, *, resume: bool = False, progress: bool = True, devices: int | None = None) -> None:
+    """Train, validating and saving a checkpoint every `optim.validate_every` epochs.
+
+    Args:
+        config: the run's flags.
+        run: the run folder.
+        resume: continue what is there (or start, if nothing is).
+        progress: show a bar.
+        devices: how many to use (default: the most that share the batch evenly).
+
+    Raises:
+        ValueError: bad flags or data, or a folder that holds another run, or this one without `resume`.
+        Interrupted: by Ctrl-C or SIGTERM, after saving the last step.
+        NonFiniteLoss: the batch is in the run folder.
+    """
+    if not resume and (run / "checkpoints").exists():
+        raise ValueError(f"{run} holds a run: add --resume to continue it, or choose another --name")
+    data = training_data(config)
+    write_config(run, config)
+    _Run(config, run, data, devices).go(progress)
+
+
+def training_data(config: Config) -> TrainingData:
+    """Prepare the objects if need be, and split the training objects of the chosen categories."""
+    folder = ensure_prepared(config)
+    check_settings(folder, config)
+    objects = Shards(folder, "train")
+    chosen = in_categories(objects.labels, len(objects.categories), config.data.categories)
+    if len(chosen) < 2:
+        raise ValueError(f"{folder}: expected at least 2 training objects in data.categories={config.data.categories}, got {len(chosen)}")
+    train, held = split_validation(chosen, config.data.validation, config.data.test_seed)
+    views = uses_images(config)
+    return TrainingData(
+        train=Pairs(objects, train, config, config.seed, views), validation=Pairs(objects, held, config, config.data.test_seed, views)
+    )
+
+
+class _Run:
+    def __init__(self, config: Config, folder: Path, data: TrainingData, devices: int | None) -> None:
+        self.config, self.folder, self.data = config, folder, data
+        self.epoch_steps = epoch_steps(data.train, config)
+        self.total = config.optim.epochs * self.epoch_steps
+        self.mesh: Mesh = device_mesh(config.optim.batch, devices)
+        self.batches: BatchIterator = training_batches(data.train, config, process=jax.process_index(), processes=jax.process_count())
+        model, rule = build(config), optimizer(config.optim, self.epoch_steps)
+        self.checkpoints = Checkpoints(folder)
+        restored = self.checkpoints.restore_last(abstract_state(model, rule, config, self.mesh))
+        if restored is None:
+            self.state: TrainState = create_state(model, rule, config, self.mesh)
+        else:
+            self.state = restored[0]
+            self.batches.set_state(restored[1])
+        self.step = int(self.state.step)
+        self.update: Step = make_step(model, rule, config, self.mesh)
+        self.predictor = Predictor(model, config.optim.batch)
+        self.rate = schedule(config.optim, self.epoch_steps)
+        self.pending: tuple[int, dict[str, jax.Array], Pair] | None = None
+        self.clock = (time.perf_counter(), self.step)
+
+    def go(self, progress: bool) -> None:
+        with _stop_signals() as stop, Log(self.folder, self.step, self.total, progress=progress) as log:
+            try:
+                self._steps(log, stop)
+            finally:
+                self.checkpoints.close()
+
+    def _steps(self, log: Log, stop: threading.Event) -> None:
+        every = self.epoch_steps * self.config.optim.validate_every
+        while self.step < self.total:
+            arrays = next(self.batches)
+            self.state, scalars = self.update(self.state, to_device(arrays, self.mesh))
+            self.step += 1
+            # Read a step's numbers only when the next one is under way, so that the device never waits for the host.
+            self._settle(log)
+            self.pending = (self.step, scalars, arrays)
+            at_end = self.step == self.total or self.step % every == 0
+            if at_end or stop.is_set():
+                self._settle(log)
+                self._validate(log) if at_end else self._save(None)
+                self.clock = (time.perf_counter(), self.step)
+            if stop.is_set() and self.step < self.total:
+                raise Interrupted(f"stopped at step {self.step} of {self.total}; continue with --resume")
+
+    def _settle(self, log: Log) -> None:
+        """Check and record the numbers of the last step that was not yet looked at."""
+        if self.pending is None:
+            return
+        step, scalars, arrays = self.pending
+        self.pending = None
+        values = {name: float(value) for name, value in scalars.items()}
+        self._check_finite(step, values, arrays)
+        log.advance(values["loss"])
+        if step % LOG_EVERY == 0 or step == self.total:
+            now = time.perf_counter()
+            rate = (step - self.clock[1]) * self.config.optim.batch / (now - self.clock[0])
+            log.write(step, values | self._position(step) | {"pairs_per_second": rate})
+            self.clock = (now, step)
+
+    def _position(self, step: int) -> dict[str, float]:
+        return {"epoch": step / self.epoch_steps, "learning_rate": float(self.rate(step - 1))}
+
+    def _validate(self, log: Log) -> None:
+        pairs, batch = self.data.validation, self.config.optim.batch
+        found, true = [], []
+        for start in range(0, len(pairs), batch):
+            chunk = [pairs[i] for i in range(start, min(start + batch, len(pairs)))]
+            found.append(self.predictor(self.state.variables, chunk))
+            true.append((np.stack([pair["R"] for pair in chunk]), np.stack([pair["t"] for pair in chunk])))
+        R, t, R_true, t_true = (np.concatenate(parts) for parts in (*zip(*found, strict=True), *zip(*true, strict=True)))
+        measures = {f"val_{name}": value for name, value in registration_metrics(R, t, R_true, t_true).items()}
+        log.write(self.step, measures | self._position(self.step))
+        epoch = self.step // self.epoch_steps
+        log.say(f"epoch {epoch}: validation RMSE(R) {measures[MEASURE]:.2f} deg, recall {measures['val_recall']:.2f}")
+        self._save(measures)
+
+    def _save(self, measures: dict[str, float] | None) -> None:
+        self.checkpoints.save(self.step, self.state, self.batches.get_state(), measures)
+
+    def _check_finite(self, step: int, values: dict[str, float], arrays: Pair) -> None:
+        if np.isfinite(list(values.values())).all():
+            return
+        path = self.folder / f"not-finite-step-{step}.npz"
+        np.savez(path, **arrays)
+        bad = ", ".join(f"{name} = {value}" for name, value in values.items() if not np.isfinite(value))
+        raise NonFiniteLoss(f"step {step}: {bad}; the batch is in {path}, the last good state in the checkpoints")
+
+
+@contextmanager
+def _stop_signals() -> Iterator[threading.Event]:
+    """Turn the first Ctrl-C or SIGTERM into an event; a second one interrupts at once."""
+    stop = threading.Event()
+    if threading.current_thread() is not threading.main_thread():
+        yield stop
+        return
+    before = {number: signal.getsignal(number) for number in (signal.SIGINT, signal.SIGTERM)}
+
+    def restore() -> None:
+        for number, handler in before.items():
+            signal.signal(number, handler)
+
+    def handle(number: int, frame: FrameType | None) -> None:
+        del number, frame
+        stop.set()
+        restore()
+
+    for number in before:
+        signal.signal(number, handle)
+    try:
+        yield stop
+    finally:
+        restore()

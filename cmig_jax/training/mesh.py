@@ -1,0 +1,59 @@
+"""Devices: a one-axis mesh, the batch split over it, everything else on every device. NumPy becomes JAX here and nowhere else."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+
+import jax
+import numpy as np
+from jax.sharding import AxisType, Mesh, NamedSharding, PartitionSpec
+
+from cmig_jax.structs import Batch, RigidTransform
+
+
+def device_mesh(batch: int, devices: int | None = None) -> Mesh:
+    """Return a mesh over the devices that share batches of `batch` pairs.
+
+    Args:
+        batch: pairs per step, over all devices.
+        devices: how many to use; by default the most that divide the batch (on several hosts: all).
+
+    Raises:
+        ValueError: a batch that does not divide over all devices of several hosts, or more devices than there are.
+    """
+    available = jax.device_count()
+    if devices is None:
+        devices = max(n for n in range(1, available + 1) if batch % n == 0)
+    if devices > available or batch % devices:
+        raise ValueError(f"{devices} devices: expected a divisor of the batch of {batch} pairs, at most {available}")
+    if jax.process_count() > 1 and devices != available:
+        raise ValueError(f"optim.batch = {batch}: expected a multiple of the {available} devices of {jax.process_count()} hosts")
+    return jax.make_mesh((devices,), ("batch",), axis_types=(AxisType.Auto,), devices=jax.devices()[:devices])
+
+
+def replicated(mesh: Mesh) -> NamedSharding:
+    """Return the sharding of the state: whole on every device."""
+    return NamedSharding(mesh, PartitionSpec())
+
+
+def split(mesh: Mesh) -> NamedSharding:
+    """Return the sharding of a batch: its first axis over the devices."""
+    return NamedSharding(mesh, PartitionSpec("batch"))
+
+
+def to_device(arrays: Mapping[str, np.ndarray], mesh: Mesh | None = None) -> Batch:
+    """Turn a loader's batch (this process's share of it) into a `Batch`, split over the mesh (None: on the default device)."""
+
+    def put(x: np.ndarray) -> jax.Array:
+        if mesh is None:
+            return jax.numpy.asarray(x)
+        return jax.make_array_from_process_local_data(split(mesh), x)
+
+    views = arrays.get("views")
+    pose = RigidTransform(R=put(arrays["R"]), t=put(arrays["t"])) if "R" in arrays else None
+    return Batch(
+        source=put(arrays["source"]),
+        target=put(arrays["target"]),
+        views=None if views is None else put(views[..., None]),
+        target_from_source=pose,
+    )

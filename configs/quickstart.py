@@ -1,0 +1,40 @@
+"""Generated objects and a small network: minutes on two cores."""
+
+from __future__ import annotations
+
+from cmig_jax.config import (
+    Config,
+    DataConfig,
+    FusionConfig,
+    ImageConfig,
+    KeypointsConfig,
+    LossConfig,
+    MatchingConfig,
+    ModelConfig,
+    OptimConfig,
+    PointsConfig,
+    ViewsConfig,
+)
+
+
+def quickstart() -> Config:
+    """Train on 20 generated categories, test on the 20 others, with noise and the 75 % crop."""
+    return Config(
+        name="quickstart",
+        data=DataConfig(source="shapes", shapes=40, points=256, categories="first-half", test_categories="second-half"),
+        views=ViewsConfig(of="both", count=6, size=32, layout="axes"),
+        model=small_network(),
+        loss=LossConfig(cross_modal="nt-xent", overlap="off", match_mean="positive"),
+        optim=OptimConfig(learning_rate=2e-3, weight_decay=1e-5, schedule="cosine", epochs=20, batch=16, clip_norm=5.0, validate_every=4),
+    )
+
+
+def small_network() -> ModelConfig:
+    """The corrected network with 128 channels and 64 keypoints."""
+    return ModelConfig(
+        points=PointsConfig(k=16, widths=(32, 32, 64, 64), dim=128),
+        image=ImageConfig(widths=(16, 32, 64, 128), blocks=(1, 1, 1, 1)),
+        fusion=FusionConfig(image="views", feed_forward=256),
+        keypoints=KeypointsConfig(count=64),
+        matching=MatchingConfig(feature_widths=(64, 32, 32)),
+    )

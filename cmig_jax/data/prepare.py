@@ -21,6 +21,7 @@ import os
 import shutil
 import signal
 import sys
+import threading
 import zlib
 from collections.abc import Callable, Iterator
 from concurrent.futures.process import BrokenProcessPool
@@ -166,14 +167,20 @@ def _run_in_workers(jobs: list[_Job], data: DataConfig, workers: int, bar: tqdm)
     stop = context.Event()
     with concurrent.futures.ProcessPoolExecutor(workers, context, _start_worker, (data, stop)) as pool:
         try:
-            futures = [pool.submit(_make_in_worker, job) for job in jobs]
+            # Ctrl-C reaches every process of a terminal: the workers inherit that it is blocked, and this process stops them.
+            signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})
+            try:
+                futures = [pool.submit(_make_in_worker, job) for job in jobs]
+            finally:
+                signal.pthread_sigmask(signal.SIG_UNBLOCK, {signal.SIGINT})
             sizes = {future: len(job.objects) for future, job in zip(futures, jobs, strict=True)}
             for future in concurrent.futures.as_completed(futures):
                 future.result()
                 bar.update(sizes[future])
             return [future.result() for future in futures]
         except BrokenProcessPool as error:
-            raise OSError(f"a process that prepared {jobs[0].out} was killed (too little memory?): use fewer --workers") from error
+            causes = "too little memory for so many workers, or a script without `if __name__ == '__main__':`"
+            raise OSError(f"a process that prepared {jobs[0].out} has ended early: {causes}") from error
         finally:
             stop.set()
             pool.shutdown(cancel_futures=True)
@@ -183,8 +190,16 @@ _worker: dict[str, Any] = {}
 
 
 def _start_worker(data: DataConfig, stop: Any) -> None:
-    signal.signal(signal.SIGINT, signal.SIG_IGN)  # Ctrl-C reaches every process: the parent stops the others
+    threading.Thread(target=_end_with_the_parent, daemon=True).start()
     _worker.update(raw=open_raw(data), stop=stop)
+
+
+def _end_with_the_parent() -> None:
+    """Wait for the parent to end, and end this process: a pool's processes would wait for ever after a parent that was killed."""
+    parent = multiprocessing.parent_process()
+    if parent is not None:
+        parent.join()
+        os._exit(1)
 
 
 def _make_in_worker(job: _Job) -> dict[str, Any]:

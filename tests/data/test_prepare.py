@@ -271,6 +271,21 @@ def test_hdf5_clouds_keep_their_order(tmp_path):
         assert stored.shape == (2048, 3)
 
 
+def test_short_clouds_begin_anew_and_are_refused_where_they_do_not_suffice(tmp_path):
+    folder = tmp_path / "raw" / "thing"
+    folder.mkdir(parents=True)
+    for i in range(2):
+        np.save(folder / f"{i}.npy", np.random.default_rng(i).normal(size=(600, 3)) * 50 + 7)
+    config = Config(data=DataConfig(source="meshes", root=str(tmp_path / "raw"), prepared=str(tmp_path / "prepared")), views=VIEWS)
+    with pytest.raises(ValueError, match=r"needs 1024 points of every object, but .* has objects of 600"):
+        ensure_prepared(config)
+    enough = dataclasses.replace(config, data=dataclasses.replace(config.data, points=512))
+    points = Shards(ensure_prepared(enough), "train").points(0)
+    assert points.shape == (2048, 3)
+    assert len(np.unique(points[:600], axis=0)) == 600
+    np.testing.assert_array_equal(points[:600], points[600:1200])
+
+
 def test_generated_shapes_by_the_command_line_and_two_workers(tmp_path, monkeypatch, capsys):
     monkeypatch.setattr(preparation, "OBJECTS_PER_SHARD", 64)
     flags = ["--data.source", "shapes", "--data.shapes", "4", "--views.layout", "axes", "--views.count", "6", "--views.size", "16"]

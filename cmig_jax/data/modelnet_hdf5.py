@@ -83,14 +83,14 @@ def _names(path: Path, count: int) -> list[str]:
 
 
 def _read_cloud(path: Path, row: int) -> np.ndarray:
-    return _data(path)[row].astype(np.float32)
+    try:
+        return _data(path, path.stat().st_mtime_ns)[row].astype(np.float32)
+    except (OSError, KeyError, IndexError) as error:
+        raise ValueError(f"{path}: row {row} of `data` cannot be read ({error}); expected an intact HDF5 file") from error
 
 
 # Objects are asked for in order; the files are compressed in chunks of many objects, so one file at a time is kept (50 MB at most).
 @functools.lru_cache(maxsize=1)
-def _data(path: Path) -> np.ndarray:
-    try:
-        with h5py.File(path) as file:
-            return np.asarray(file["data"])
-    except OSError as error:
-        raise ValueError(f"{path}: `data` cannot be read ({error}); expected an intact HDF5 file") from error
+def _data(path: Path, modified_ns: int) -> np.ndarray:
+    with h5py.File(path) as file:
+        return np.asarray(file["data"])

@@ -61,7 +61,10 @@ def open_stanford(root: str | None) -> RawDataset:
     """
     folder = existing_folder(root, "a folder of PLY models, or of range scans with their .conf")
     confs = {path.parent: path for path in sorted(folder.rglob("*.conf"))}
-    objects = [RawObject(place.resolve().name, 0, "test", functools.partial(_fused, conf)) for place, conf in confs.items()]
+    objects = []
+    for place, conf in confs.items():
+        name = folder.resolve().name if place == folder else str(place.relative_to(folder))
+        objects.append(RawObject(name, 0, "test", functools.partial(_fused, conf)))
     models = [path for path in sorted(folder.rglob("*.ply")) if path.parent not in confs and not path.name.startswith(".")]
     objects += [RawObject(str(path.relative_to(folder)), 0, "test", functools.partial(read_geometry, path)) for path in models]
     if not objects:

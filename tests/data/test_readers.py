@@ -183,6 +183,14 @@ def test_every_format_gives_the_same_surface(tmp_path, suffix):
     assert mesh.volume == pytest.approx(6, rel=1e-5)
 
 
+def test_parts_of_an_obj_and_ascii_stl(tmp_path):
+    first = "mtllib none.mtl\no one\nusemtl red\nv 0 0 0\nv 1 0 0\nv 0 1 0\nf 1 2 3\n"
+    (tmp_path / "a.obj").write_text(first + "o two\nusemtl blue\nv 5 0 0\nv 6 0 0\nv 6 1 0\nv 5 1 0\nf 4/1 5/1 6/1 7/1\n")
+    assert read_geometry(tmp_path / "a.obj").area == pytest.approx(1.5)
+    (tmp_path / "a.stl").write_text(_box().export(file_type="stl_ascii"))
+    assert read_geometry(tmp_path / "a.stl").area == pytest.approx(22)
+
+
 def test_clouds(tmp_path):
     points = _RNG.normal(size=(20, 3)).astype(np.float32)
     np.save(tmp_path / "a.npy", points.astype(np.float64))
@@ -337,10 +345,13 @@ def test_a_bad_conf_is_an_error(tmp_path, line, message):
         read_scans(tmp_path / "none.conf")
 
 
+_FEW = (["bun000.ply"], ["bun045.ply"], ["bun315.ply"])
+
+
 def test_real_scans_of_the_bunny_fit(tmp_path):
     folder = _shared("stanford_bunny_scans")
     lines = [line.split() for line in (folder / "bun.conf").read_text().splitlines()]
-    few = [f"bmesh {folder / words[1]} {' '.join(words[2:])}" for words in lines if words[1] in ("bun000.ply", "bun045.ply", "bun315.ply")]
+    few = [f"bmesh {folder / words[1]} {' '.join(words[2:])}" for words in lines if words[1:2] in _FEW]
     (tmp_path / "few.conf").write_text("\n".join(few))
     scans = {scan.name: scan for scan in read_scans(tmp_path / "few.conf")}
     world = {name: s.points @ s.world_from_scan[:3, :3].T + s.world_from_scan[:3, 3] for name, s in scans.items()}

@@ -34,7 +34,14 @@ def knn(points: Array, k: int, rows: int = 0) -> Array:
         rows: rows of the distance matrix that exist at a time; 0: all.
     """
     points = jax.lax.stop_gradient(points)
-    return map_rows(lambda query: jax.lax.top_k(-squared_distances(query, points), k)[1], points, rows)
+
+    def block(query: Array) -> Array:
+        square = squared_distances(query, points)
+        # In two axes: XLA's CPU compiler merges slices of the result into a top-k of more axes and then sorts whole rows.
+        index = jax.lax.top_k(-square.reshape(-1, square.shape[-1]), k)[1]
+        return index.reshape(*square.shape[:-1], k)
+
+    return map_rows(block, points, rows)
 
 
 def nearest(query: Array, points: Array, rows: int = 0) -> tuple[Array, Array]:
@@ -45,6 +52,47 @@ def nearest(query: Array, points: Array, rows: int = 0) -> tuple[Array, Array]:
         return jnp.argmin(square, axis=-1), jnp.sqrt(jnp.min(square, axis=-1))
 
     return map_rows(block, jax.lax.stop_gradient(query), rows)
+
+
+@jax.custom_vjp
+def neighbour_maximum(x: Array, neighbours: Array) -> Array:
+    """Return the maximum over each point's neighbours, per channel.
+
+    The derivative goes to the neighbour that gave the maximum (the nearest of equal ones): one number per point and channel is
+    scattered, where differentiating the gather would scatter one per edge.
+
+    Args:
+        x: `[B, N, C]`.
+        neighbours: `[B, N, k]` indices into N.
+
+    Returns:
+        `[B, N, C]`.
+    """
+    return _maximum_and_source(x, neighbours)[0]
+
+
+def _maximum_and_source(x: Array, neighbours: Array) -> tuple[Array, Array]:
+    def visit(best: tuple[Array, Array], index: Array) -> tuple[tuple[Array, Array], None]:
+        value, source = best
+        candidate = jnp.take_along_axis(x, index[..., None], axis=1)
+        better = candidate > value
+        return (jnp.where(better, candidate, value), jnp.where(better, index[..., None], source)), None
+
+    start = jnp.full_like(x, -jnp.inf), jnp.broadcast_to(neighbours[..., :1], x.shape)
+    return jax.lax.scan(visit, start, jnp.moveaxis(neighbours, -1, 0), unroll=True)[0]
+
+
+def _neighbour_maximum_forward(x: Array, neighbours: Array) -> tuple[Array, Array]:
+    return _maximum_and_source(x, neighbours)
+
+
+def _neighbour_maximum_backward(source: Array, gradient: Array) -> tuple[Array, None]:
+    channel = jnp.arange(gradient.shape[-1])[None, :]
+    scatter = jax.vmap(lambda g, s: jnp.zeros_like(g).at[s, channel].add(g))
+    return scatter(gradient, source), None
+
+
+neighbour_maximum.defvjp(_neighbour_maximum_forward, _neighbour_maximum_backward)
 
 
 def map_rows(function: Callable[[Array], T], x: Array, rows: int) -> T:

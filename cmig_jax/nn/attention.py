@@ -8,6 +8,7 @@ attention over equal values returns that value whatever the weights, so callers 
 from __future__ import annotations
 
 import flax.linen as nn
+import jax
 import jax.numpy as jnp
 from jax import Array
 
@@ -82,10 +83,33 @@ class Attention(nn.Module):
 
 def attend(query: Array, key: Array, value: Array, rows: int = 0) -> Array:
     """Return `softmax(Q K^T / sqrt(C)) V` for `[..., N, C]`, `[..., M, C]`, `[..., M, C]`, in chunks of `rows` queries (0: at once)."""
+    return map_rows(lambda q: _attend(q, key, value), query, rows)
 
-    def block(q: Array) -> Array:
-        scores = jnp.einsum("...nc,...mc->...nm", q, key).astype(jnp.promote_types(q.dtype, jnp.float32))
-        weights = nn.softmax(scores / query.shape[-1] ** 0.5, axis=-1).astype(value.dtype)
-        return jnp.einsum("...nm,...mc->...nc", weights, value)
 
-    return map_rows(block, query, rows)
+@jax.custom_vjp
+def _attend(query: Array, key: Array, value: Array) -> Array:
+    return _attend_forward(query, key, value)[0]
+
+
+def _attend_forward(query: Array, key: Array, value: Array) -> tuple[Array, tuple[Array, ...]]:
+    scores = jnp.einsum("...nc,...mc->...nm", query, key).astype(jnp.promote_types(query.dtype, jnp.float32))
+    weights = nn.softmax(scores / query.shape[-1] ** 0.5, axis=-1).astype(value.dtype)
+    attended = jnp.einsum("...nm,...mc->...nc", weights, value)
+    return attended, (query, key, value, weights, attended)
+
+
+def _attend_backward(saved: tuple[Array, ...], gradient: Array) -> tuple[Array, Array, Array]:
+    """Differentiate by hand: XLA's own derivative of batched attention takes thrice the time on a CPU."""
+    query, key, value, weights, attended = saved
+    wide = jnp.promote_types(query.dtype, jnp.float32)
+    of_weights = jnp.einsum("...nc,...mc->...nm", gradient, value).astype(wide)
+    mean = jnp.sum((gradient * attended).astype(wide), axis=-1, keepdims=True)
+    of_scores = (weights.astype(wide) * (of_weights - mean) / query.shape[-1] ** 0.5).astype(query.dtype)
+    return (
+        jnp.einsum("...nm,...mc->...nc", of_scores, key),
+        jnp.einsum("...nm,...nc->...mc", of_scores, query),
+        jnp.einsum("...nm,...nc->...mc", weights, gradient),
+    )
+
+
+_attend.defvjp(_attend_forward, _attend_backward)

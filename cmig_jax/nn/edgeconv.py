@@ -13,7 +13,7 @@ import jax
 import jax.numpy as jnp
 from jax import Array
 
-from cmig_jax.geometry.neighbors import knn
+from cmig_jax.geometry.neighbors import knn, neighbour_maximum
 from cmig_jax.nn.mlp import Dense, torch_kernel
 from cmig_jax.nn.norm import BatchNorm, Moments, channels, moments
 
@@ -69,7 +69,7 @@ class EdgeConv(nn.Module):
         affine = affine.replace(mean=affine.mean * sign - shift, scale=affine.scale * sign)
         outputs = []
         for p, q, index in zip(neighbour, centre, neighbours, strict=True):
-            edge = jnp.max(jax.vmap(lambda x, i: x[i])(p, index), axis=-2) + q
+            edge = neighbour_maximum(p, index) + q
             outputs.append(nn.relu(affine(edge)).astype(clouds[0].dtype))
         return tuple(outputs)
 

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from typing import TypeVar
+
 import jax
 import jax.numpy as jnp
 import optax
@@ -10,6 +12,8 @@ from jax import Array
 from cmig_jax.config import LossConfig
 from cmig_jax.geometry.neighbors import nearest, squared_distances
 from cmig_jax.structs import Batch, Iteration, Prediction, RigidTransform
+
+T = TypeVar("T")
 
 
 def losses(prediction: Prediction, batch: Batch, config: LossConfig) -> dict[str, Array]:
@@ -24,8 +28,7 @@ def losses(prediction: Prediction, batch: Batch, config: LossConfig) -> dict[str
         scalars: `cross_modal`, `overlap`, `mask`, then `matching_<i>` and `credibility_<i>` per iteration (the pcrnet head, which has
         no correspondences, has `pose_<i>` instead).
     """
-    assert batch.target_from_source is not None
-    pose = batch.target_from_source
+    pose = _present(batch.target_from_source)
     terms = {}
     if config.cross_modal != "off":
         terms["cross_modal"] = _cross_modal(prediction, config)
@@ -84,10 +87,8 @@ def overlap(f: Array, g: Array, overlaps_x: Array, overlaps_y: Array, margins: t
 
 def mask(prediction: Prediction) -> Array:
     """Teach scores the negative entropy of the first matching, rows for the source, columns for the target (Sec. III-F, L_MP)."""
-    assert prediction.source_scores is not None
-    assert prediction.target_scores is not None
-    match, chosen = prediction.iterations[0].match, prediction.keypoints
-    sides = ((prediction.source_scores, chosen.source_index, -1), (prediction.target_scores, chosen.target_index, -2))
+    match, chosen = _present(prediction.iterations[0].match), prediction.keypoints
+    sides = ((_present(prediction.source_scores), chosen.source_index, -1), (_present(prediction.target_scores), chosen.target_index, -2))
     total = jnp.zeros((), match.dtype)
     for scores, index, axis in sides:
         log_p = jax.nn.log_softmax(jax.lax.stop_gradient(match), axis=axis)
@@ -98,8 +99,8 @@ def mask(prediction: Prediction) -> Array:
 
 def matching(prediction: Prediction, iteration: Iteration, config: LossConfig) -> Array:
     """Likelihood of the true correspondents under the matching matrix (L_CS)."""
-    index, label = prediction.keypoints.match_index, prediction.keypoints.match_label
-    log_p = jax.nn.log_softmax(iteration.match, axis=-1)
+    index, label = _present(prediction.keypoints.match_index), _present(prediction.keypoints.match_label)
+    log_p = jax.nn.log_softmax(_present(iteration.match), axis=-1)
     chosen = jnp.take_along_axis(log_p, index[..., None], axis=-1)[..., 0]
     count = jnp.maximum(jnp.sum(label), 1) if config.match_mean == "positive" else label.size
     return -jnp.sum(label * chosen) / count
@@ -115,25 +116,29 @@ def credibility(prediction: Prediction, iteration: Iteration, source: Array, pos
         pose: true target_from_source.
         config: `credibility_label`, `match_threshold`.
     """
-    chosen = prediction.keypoints
+    chosen, logit = prediction.keypoints, _present(iteration.logit)
     if config.credibility_label == "index":
-        right = iteration.correspondence == chosen.match_index
+        right = _present(iteration.correspondence) == chosen.match_index
     else:
         keypoints = jnp.take_along_axis(source, chosen.source_index[..., None], axis=1)
-        offset = pose.apply(keypoints) - iteration.corresponding
+        offset = pose.apply(keypoints) - _present(iteration.corresponding)
         right = jnp.sum(offset**2, axis=-1) < config.match_threshold**2
-    return jnp.mean(optax.sigmoid_binary_cross_entropy(iteration.logit, right.astype(iteration.logit.dtype)))
+    return jnp.mean(optax.sigmoid_binary_cross_entropy(logit, right.astype(logit.dtype)))
+
+
+def _present(value: T | None) -> T:
+    assert value is not None, "this loss needs what a training pass with this head returns"
+    return value
 
 
 def _cross_modal(prediction: Prediction, config: LossConfig) -> Array:
     points = 0.5 * (jnp.max(prediction.source_features, axis=1) + jnp.max(prediction.target_features, axis=1))
-    assert prediction.image_features is not None
-    images = jnp.mean(prediction.image_features, axis=1).astype(points.dtype)
+    images = jnp.mean(_present(prediction.image_features), axis=1).astype(points.dtype)
     return cross_modal(points, images, config.temperature, include_positive=config.cross_modal == "nt-xent")
 
 
 def _overlap(prediction: Prediction, batch: Batch, config: LossConfig) -> Array:
-    moved = batch.target_from_source.apply(batch.source)
+    moved = _present(batch.target_from_source).apply(batch.source)
     overlaps_x = jax.vmap(nearest)(moved, batch.target)[1] < config.overlap_threshold
     overlaps_y = jax.vmap(nearest)(batch.target, moved)[1] < config.overlap_threshold
     per_pair = jax.vmap(lambda f, g, x, y: overlap(f, g, x, y, config.margins, config.overlap_mean == "active"))
@@ -143,5 +148,5 @@ def _overlap(prediction: Prediction, batch: Batch, config: LossConfig) -> Array:
 def _pose(iteration: Iteration, prediction: Prediction, batch: Batch) -> Array:
     """Mean distance between the keypoints under this iteration's pose and under the true one."""
     keypoints = jnp.take_along_axis(batch.source, prediction.keypoints.source_index[..., None], axis=1)
-    offset = iteration.step.apply(iteration.source) - batch.target_from_source.apply(keypoints)
+    offset = iteration.step.apply(iteration.source) - _present(batch.target_from_source).apply(keypoints)
     return jnp.mean(jnp.sqrt(jnp.sum(offset**2, axis=-1) + 1e-12))

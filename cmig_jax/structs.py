@@ -93,7 +93,8 @@ class Keypoints:
 
     Attributes:
         source_index, target_index: `[B, K]` into the clouds.
-        match_index: `[B, K]` position among the target keypoints of the one nearest to each source keypoint under the true pose; None in evaluation.
+        match_index: `[B, K]` position among the target keypoints of the true correspondent of each source keypoint, the nearest under
+            the true pose; None in evaluation.
         match_label: `[B, K]` 1 where that distance is below the threshold, else 0; None in evaluation.
     """
 

@@ -7,7 +7,7 @@ uint8, `object [P, 3]` the complete clean object in the source's frame, `label` 
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import Literal, Protocol
+from typing import Any, Literal, Protocol
 
 import numpy as np
 from scipy.spatial.transform import Rotation
@@ -15,7 +15,7 @@ from scipy.spatial.transform import Rotation
 from cmig_jax.config import Categories, Config, DataConfig, ViewsConfig
 from cmig_jax.data.render import render_views
 
-Pair = dict[str, np.ndarray]
+Pair = dict[str, Any]
 FAR = 500.0  # distance factor of the crop's far point: from there, "nearest" is a half-space to within rounding
 
 
@@ -32,11 +32,11 @@ class Objects(Protocol):
         """Names of the categories."""
         ...
 
-    def points(self, index: int) -> np.ndarray:
+    def points(self, i: int) -> np.ndarray:
         """Surface points `[P, 3]` in the unit sphere."""
         ...
 
-    def views(self, index: int) -> np.ndarray | None:
+    def views(self, i: int) -> np.ndarray | None:
         """Views `[V, H, W]` rendered ahead of time, or None."""
         ...
 

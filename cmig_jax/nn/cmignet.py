@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 from typing import Literal
 
 import chex
@@ -156,7 +157,7 @@ class CMIGNet(nn.Module):
         correspondent, label = true_correspondents(batch.source, batch.target, batch.target_from_source, self.match_threshold, self.rows)
         if self.select == "all":
             every = self._keypoints(batch, None, None, None)
-            return every.replace(match_index=correspondent, match_label=label)
+            return dataclasses.replace(every, match_index=correspondent, match_label=label)
         if source_index is None:
             assert key is not None
             source_index = draw_for_training(key, label, self.keypoints)
@@ -172,7 +173,7 @@ class CMIGNet(nn.Module):
             else:
                 iteration = self._solve(head(source, target, train=train), source, target)
             iterations.append(iteration)
-            source = source.replace(points=iteration.step.apply(source.points))
+            source = dataclasses.replace(source, points=iteration.step.apply(source.points))
             pose = iteration.step.compose(pose)
         return tuple(iterations), pose
 

@@ -8,6 +8,8 @@ of the edges follow from those of the points.
 
 from __future__ import annotations
 
+import dataclasses
+
 import flax.linen as nn
 import jax
 import jax.numpy as jnp
@@ -15,7 +17,7 @@ from jax import Array
 
 from cmig_jax.geometry.neighbors import knn, neighbour_maximum
 from cmig_jax.nn.mlp import Dense, torch_kernel
-from cmig_jax.nn.norm import BatchNorm, Moments, channels, moments
+from cmig_jax.nn.norm import Affine, BatchNorm, Moments, channels, moments
 
 Clouds = tuple[Array, ...]
 
@@ -65,8 +67,8 @@ class EdgeConv(nn.Module):
         centre, shift_centre = _centred([q for _, q in projections])
         shift = shift_neighbour + shift_centre
         batch = _edge_moments(neighbour, centre, neighbours) if train else None
-        affine = norm.affine(None if batch is None else batch.replace(mean=(batch.mean + shift) * sign))
-        affine = affine.replace(mean=affine.mean * sign - shift, scale=affine.scale * sign)
+        affine = norm.affine(None if batch is None else dataclasses.replace(batch, mean=(batch.mean + shift) * sign))
+        affine = Affine(mean=affine.mean * sign - shift, scale=affine.scale * sign, bias=affine.bias)
         outputs = []
         for p, q, index in zip(neighbour, centre, neighbours, strict=True):
             edge = neighbour_maximum(p, index) + q
@@ -85,7 +87,7 @@ class EdgeConv(nn.Module):
 
 def _centred(parts: list[Array]) -> tuple[list[Array], Array]:
     """Take a rough mean `[C]` off every part, so that squares keep their digits; return it too."""
-    shift = jax.lax.stop_gradient(sum(jnp.mean(x, axis=(0, 1)) for x in parts) / len(parts))
+    shift = jax.lax.stop_gradient(jnp.mean(jnp.stack([jnp.mean(x, axis=(0, 1)) for x in parts]), axis=0))
     return [x - channels(shift, 3) for x in parts], shift
 
 
@@ -93,7 +95,7 @@ def _edge_moments(neighbour: list[Array], centre: list[Array], neighbours: Cloud
     """Statistics of `p_j + q_i` over all edges, from sums over points: of p by in-degree, of p_j q_i by the adjacency matrix."""
     k = neighbours[0].shape[-1]
     count = k * sum(p.shape[0] * p.shape[1] for p in neighbour)
-    first, second = jnp.zeros(()), jnp.zeros(())
+    first, second = jnp.zeros_like(neighbour[0][0, 0]), jnp.zeros_like(neighbour[0][0, 0])
     for p, q, index in zip(neighbour, centre, neighbours, strict=True):
         adjacency = _adjacency(index, p.shape[1], p.dtype)
         degree = jnp.sum(adjacency, axis=1)[..., None]

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 
 import flax.linen as nn
 import jax
@@ -46,9 +46,13 @@ def moments(parts: Sequence[Array]) -> Moments:
     """Take mean and variance over everything but the channels, jointly over `parts` (each `[..., C]`), in float32 at least."""
     wide = [part.astype(jnp.promote_types(part.dtype, jnp.float32)) for part in parts]
     count = sum(part.size // part.shape[-1] for part in wide)
-    mean = sum(_sum(part) for part in wide) / count
-    variance = sum(_sum((part - channels(mean, part.ndim)) ** 2) for part in wide) / count
-    return Moments(mean=jnp.asarray(mean), variance=jnp.asarray(variance), count=count)
+    mean = _total(_sum(part) for part in wide) / count
+    variance = _total(_sum((part - channels(mean, part.ndim)) ** 2) for part in wide) / count
+    return Moments(mean=mean, variance=variance, count=count)
+
+
+def _total(parts: Iterable[Array]) -> Array:
+    return jnp.sum(jnp.stack(list(parts)), axis=0)
 
 
 def _sum(x: Array) -> Array:

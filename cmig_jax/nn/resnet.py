@@ -31,7 +31,7 @@ class ViewEncoder(nn.Module):
         """Encode views `[..., H, W, 1]` (uint8 depth) or `[..., H, W, 3]` (normalised RGB) to `[..., widths[-1]]`."""
         x = Stem(self.widths[0], dtype=self.dtype, name="stem")(views.reshape(-1, *views.shape[-3:]))
         x = nn.relu(BatchNorm(self.widths[0], name="stem_norm")(x, train=train))
-        x = nn.max_pool(x, (3, 3), (2, 2), padding=((1, 1), (1, 1)))
+        x = nn.max_pool(x, (3, 3), (2, 2), padding=((1, 1), (1, 1)))  # pyright: ignore[reportArgumentType]
         for stage, (width, count) in enumerate(zip(self.widths, self.blocks, strict=True)):
             for block in range(count):
                 stride = 2 if stage > 0 and block == 0 else 1

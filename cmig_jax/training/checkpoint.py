@@ -21,9 +21,9 @@ class Checkpoints:
     def __init__(self, run: Path) -> None:
         policies = ocp.training.preservation_policies
         best = policies.BestN(get_metric_fn=_rank, n=1, keep_checkpoints_without_metrics=False)
-        self._checkpointer = ocp.training.Checkpointer(
-            (run / "checkpoints").absolute(),
-            preservation_policy=policies.AnyPreservationPolicy([policies.LatestN(1), best]),
+        self._checkpointer: Any = ocp.training.Checkpointer(
+            str((run / "checkpoints").absolute()),
+            preservation_policy=policies.AnyPreservationPolicy([policies.LatestN(1), best]),  # pyright: ignore[reportArgumentType]
             cleanup_tmp_directories=True,
         )
 
@@ -116,7 +116,7 @@ def load_state(run: Path, like: Any, which: Literal["best", "last"] = "best") ->
     folder = (run / "checkpoints").absolute()
     if not folder.is_dir():
         raise ValueError(f"{folder}: expected checkpoints, found no such folder (has train.py run long enough to save one?)")
-    with ocp.training.Checkpointer(folder) as checkpointer:
+    with ocp.training.Checkpointer(str(folder)) as checkpointer:
         found = checkpointer.checkpoints
         if not found:
             raise ValueError(f"{folder}: expected a checkpoint, found none (has train.py run long enough to save one?)")

@@ -147,7 +147,7 @@ class _Run:
             self.clock = (now, step)
 
     def _position(self, step: int) -> dict[str, float]:
-        return {"epoch": step / self.epoch_steps, "learning_rate": float(self.rate(step - 1))}
+        return {"epoch": step / self.epoch_steps, "learning_rate": float(np.asarray(self.rate(step - 1)))}
 
     def _validate(self, log: Log) -> None:
         pairs, batch = self.data.validation, self.config.optim.batch
@@ -170,7 +170,7 @@ class _Run:
         if np.isfinite(list(values.values())).all():
             return
         path = self.folder / f"not-finite-step-{step}.npz"
-        np.savez(path, **arrays)
+        np.savez(path, **arrays)  # pyright: ignore[reportArgumentType]
         bad = ", ".join(f"{name} = {value}" for name, value in values.items() if not np.isfinite(value))
         raise NonFiniteLoss(f"step {step}: {bad}; the batch is in {path}, the last good state in the checkpoints")
 

@@ -87,7 +87,7 @@ def make_step(model: CMIGNet, optimizer: optax.GradientTransformation, config: C
         )
         assert isinstance(prediction, Prediction)
         terms = losses(prediction, batch, config.loss)
-        return sum(terms.values(), jnp.zeros(())), (terms, updates["batch_stats"])
+        return jnp.sum(jnp.stack(list(terms.values()))), (terms, updates["batch_stats"])
 
     def step(state: TrainState, batch: Batch) -> tuple[TrainState, dict[str, Array]]:
         key = jax.random.fold_in(jax.random.key(config.seed), state.step)

@@ -1,0 +1,147 @@
+"""Two clouds of a user's own in, one transform out: owns scale, sampling, views and batching."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, Literal
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from cmig_jax import baselines
+from cmig_jax.config import Config
+from cmig_jax.data.pairs import Pair
+from cmig_jax.data.render import render_views
+from cmig_jax.nn.build import build, uses_images
+from cmig_jax.structs import RigidTransform
+from cmig_jax.training.checkpoint import load_state, read_config
+from cmig_jax.training.mesh import device_mesh
+from cmig_jax.training.optim import optimizer
+from cmig_jax.training.predict import Predictor
+from cmig_jax.training.state import abstract_state
+
+Floats = NDArray[np.float64]
+
+
+@dataclass(frozen=True)
+class Network:
+    """A trained network.
+
+    Attributes:
+        config: the flags it was trained with.
+        variables: parameters and running statistics.
+        predictor: its compiled evaluation.
+        step: training steps behind it.
+    """
+
+    config: Config
+    variables: dict[str, Any]
+    predictor: Predictor
+    step: int
+
+    def __call__(self, pairs: Sequence[Pair]) -> tuple[np.ndarray, np.ndarray]:
+        """Register prepared pairs (`data.pairs`, with views where the network uses them): R `[n, 3, 3]`, t `[n, 3]`."""
+        return self.predictor(self.variables, pairs)
+
+    @property
+    def points(self) -> int:
+        """Points per cloud that the network was trained on."""
+        data = self.config.data
+        return data.points if data.crop == "none" else round(data.points * data.keep)
+
+
+def load(run: str | Path, which: Literal["best", "last"] = "best", batch: int = 1) -> Network:
+    """Load a trained network from a run folder of `train.py`.
+
+    Args:
+        run: the folder.
+        which: checkpoint: the best on validation, or the last.
+        batch: pairs per compiled call.
+
+    Raises:
+        ValueError: no run folder, no checkpoint in it, or one that does not fit its config; the message names the file.
+    """
+    run = Path(run)
+    config = read_config(run)
+    model = build(config)
+    like = abstract_state(model, optimizer(config.optim, 1), config, device_mesh(1, 1))
+    state = load_state(run, like, which)
+    return Network(config=config, variables=state.variables, predictor=Predictor(model, batch), step=int(state.step))
+
+
+def register(source: ArrayLike, target: ArrayLike, network: Network, *, points: int | None = None, refine: bool = False) -> RigidTransform:
+    """Find the rigid transform that takes one cloud onto another.
+
+    The clouds may differ in size, density and units, and may overlap in part. They are centred and scaled together to the unit
+    sphere, thinned to the number of points that the network knows (the choice is random but always the same), and rendered for its
+    image branch. The network was trained on rotations of up to `data.max_angle_deg` about each axis: expect no more of it.
+
+    Args:
+        source: `[N, 3]`, in any unit.
+        target: `[M, 3]`, in the same unit.
+        network: of `load`.
+        points: points per cloud to keep at most; by default what the network was trained on. Larger clouds cost more.
+        refine: finish with point-to-point ICP on the whole clouds, which sharpens a good pose.
+
+    Returns:
+        target_from_source, NumPy arrays R `[3, 3]` and t `[3]` in the unit of the clouds.
+
+    Raises:
+        ValueError: a cloud that is empty, not `[N, 3]` numbers, not finite, with all points on one line, or with fewer points than the
+            network's neighbours or keypoints; a network that needs images of complete objects, or clouds of equal size, and has none.
+    """
+    x, y = _cloud(source, "source", network.config), _cloud(target, "target", network.config)
+    centre_x, centre_y = x.mean(axis=0), y.mean(axis=0)
+    scale = max(np.linalg.norm(x - centre_x, axis=1).max(), np.linalg.norm(y - centre_y, axis=1).max())
+    count = network.points if points is None else points
+    pair = {
+        "source": _thinned((x - centre_x) / scale, count, seed=0).astype(np.float32),
+        "target": _thinned((y - centre_y) / scale, count, seed=1).astype(np.float32),
+    }
+    if uses_images(network.config):
+        pair["views"] = _views(pair, network.config)
+    R, t = (np.asarray(v[0], np.float64) for v in network([pair]))
+    t = centre_y + scale * t - R @ centre_x
+    if refine:
+        R, t = baselines.icp(x, y, max_distance=0.1 * scale, start=(R, t))
+    return RigidTransform(R=R, t=t)  # type: ignore[arg-type]
+
+
+def _cloud(points: ArrayLike, name: str, config: Config) -> Floats:
+    """Check a user's cloud."""
+    try:
+        cloud = np.asarray(points, np.float64)
+    except (TypeError, ValueError) as error:
+        raise ValueError(f"{name}: expected numbers [N, 3] ({error})") from error
+    if cloud.ndim != 2 or cloud.shape[1] != 3:
+        raise ValueError(f"{name} has shape {cloud.shape}: expected [N, 3]")
+    fewest = max(config.model.points.k, 3 if config.model.keypoints.select == "all" else config.model.keypoints.count)
+    if len(cloud) < fewest:
+        raise ValueError(f"{name} has {len(cloud)} points: expected at least {fewest}, the network's neighbours and keypoints")
+    bad = np.flatnonzero(~np.isfinite(cloud).all(axis=1))
+    if len(bad):
+        raise ValueError(f"{name}[{bad[0]}] = {cloud[bad[0]]}: expected finite coordinates ({len(bad)} points are not)")
+    spread = np.linalg.svd(cloud - cloud.mean(axis=0), compute_uv=False)
+    if spread[1] <= 1e-9 * max(spread[0], np.abs(cloud).max()):
+        raise ValueError(f"{name}: all points are equal or on one line, which leaves the rotation open; expected a surface")
+    return cloud
+
+
+def _thinned(cloud: Floats, count: int, seed: int) -> Floats:
+    """Keep `count` random points of a larger cloud, the same ones every time."""
+    if len(cloud) <= count:
+        return cloud
+    return cloud[np.sort(np.random.default_rng(seed).choice(len(cloud), count, replace=False))]
+
+
+def _views(pair: Pair, config: Config) -> np.ndarray:
+    views = config.views
+    if views.of == "object":
+        raise ValueError(
+            "this network was trained on images of the complete object (views.of=object), which two partial clouds do not give: "
+            "train with views.of=both"
+        )
+    clouds = {"source": ["source"], "target": ["target"], "both": ["source", "target"]}[views.of]
+    return np.stack([render_views(pair[c], layout=views.layout, count=views.count, size=views.size, fit=True) for c in clouds])

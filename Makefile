@@ -1,8 +1,8 @@
 # make setup | lint | test | demo | clean; `make` alone lists them.
 
 PYTHON ?= python3
-# The twin network of the parity tests needs torch; any CPU build will do. Where pip would fetch the large CUDA build instead:
-#   make test PIP_FLAGS='--extra-index-url https://download.pytorch.org/whl/cpu'
+# The twin network of the parity tests needs torch; any CPU build will do. Where pip would fetch the large CUDA build instead, name
+# PyTorch's CPU index: make test PIP_FLAGS='--extra-index-url ...'
 TORCH ?= $(if $(filter 3.11,$(PYTHON_VERSION)),torch==2.13.0,torch>=2.5)
 PIP_FLAGS ?=
 JOBS ?= 2

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import functools
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -21,6 +22,7 @@ from cmig_jax.training.mesh import device_mesh
 from cmig_jax.training.optim import optimizer
 from cmig_jax.training.predict import Predictor
 from cmig_jax.training.state import abstract_state
+from cmig_jax.weights import PRETRAINED, check_variables, read_weights
 
 Floats = NDArray[np.float64]
 
@@ -52,26 +54,39 @@ class Network:
         return data.points if data.crop == "none" else round(data.points * data.keep)
 
 
-def load(run: str | Path, which: Literal["best", "last"] = "best", batch: int = 1) -> Network:
-    """Load a trained network from a run folder of `train.py`.
+def load(source: str | Path | None = None, which: Literal["best", "last"] = "best", batch: int = 1) -> Network:
+    """Load a trained network.
 
     Args:
-        run: the folder.
-        which: checkpoint: the best on validation, or the last.
+        source: a run folder of `train.py`, a weights file (`cmig_jax.weights`), or None for the network that comes with the package.
+        which: checkpoint of a run folder: the best on validation, or the last.
         batch: pairs per compiled call.
 
     Raises:
         ValueError: no run folder, no checkpoint in it, or one that does not fit its config; the message names the file.
     """
-    run = Path(run)
-    config = read_config(run)
+    path = PRETRAINED if source is None else Path(source)
+    if path.suffix == ".npz":
+        config, step, variables = read_weights(path)
+        model = build(config)
+        like = abstract_state(model, optimizer(config.optim, 1), config, device_mesh(1, 1))
+        check_variables(variables, like.variables, str(path))
+        return Network(config=config, variables=variables, predictor=Predictor(model, batch), step=step)
+    config = read_config(path)
     model = build(config)
     like = abstract_state(model, optimizer(config.optim, 1), config, device_mesh(1, 1))
-    state = load_state(run, like, which)
+    state = load_state(path, like, which)
     return Network(config=config, variables=state.variables, predictor=Predictor(model, batch), step=int(state.step))
 
 
-def register(source: ArrayLike, target: ArrayLike, network: Network, *, points: int | None = None, refine: bool = False) -> RigidTransform:
+@functools.cache
+def _pretrained() -> Network:
+    return load()
+
+
+def register(
+    source: ArrayLike, target: ArrayLike, network: Network | None = None, *, points: int | None = None, refine: bool = False
+) -> RigidTransform:
     """Find the rigid transform that takes one cloud onto another.
 
     The clouds may differ in size, density and units, and may overlap in part. They are centred and scaled together to the unit
@@ -81,7 +96,7 @@ def register(source: ArrayLike, target: ArrayLike, network: Network, *, points: 
     Args:
         source: `[N, 3]`, in any unit.
         target: `[M, 3]`, in the same unit.
-        network: of `load`.
+        network: of `load`; by default the one that comes with the package, which was trained on generated objects.
         points: points per cloud to keep at most; by default what the network was trained on. Larger clouds cost more.
         refine: finish with point-to-point ICP on the whole clouds, which sharpens a good pose.
 
@@ -92,6 +107,7 @@ def register(source: ArrayLike, target: ArrayLike, network: Network, *, points: 
         ValueError: a cloud that is empty, not `[N, 3]` numbers, not finite, with all points on one line, or with fewer points than the
             network's neighbours or keypoints; a network that needs images of complete objects, or clouds of equal size, and has none.
     """
+    network = _pretrained() if network is None else network
     x, y = _cloud(source, "source", network.config), _cloud(target, "target", network.config)
     centre_x, centre_y = x.mean(axis=0), y.mean(axis=0)
     scale = max(np.linalg.norm(x - centre_x, axis=1).max(), np.linalg.norm(y - centre_y, axis=1).max())

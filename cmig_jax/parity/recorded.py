@@ -11,7 +11,7 @@ import re
 import zipfile
 import zlib
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
@@ -55,6 +55,32 @@ class Case:
     def iterations(self) -> int:
         """Iterations n that were recorded."""
         return 1 + max(int(match[1]) for key in self.outputs if (match := re.match(r"it(\d+)/", key)))
+
+
+@dataclass(frozen=True)
+class Run:
+    """What one pass of a network gave, under PyTorch names and in its layout.
+
+    Attributes:
+        outputs: every intermediate result by its recorded name; in training mode also `loss_terms` and `loss`.
+        gradients: by parameter, those that have one; empty in evaluation mode.
+        buffers: running statistics after the pass.
+        cotangents: derivatives of the loss by intermediate results, where the network recorded them.
+    """
+
+    outputs: Arrays
+    gradients: Arrays
+    buffers: Arrays
+    cotangents: Arrays = field(default_factory=dict)
+
+    def recorded(self, key: str) -> NDArray | None:
+        """Return what a case stores under `key`; None if the run has no such number."""
+        kind, _, name = key.partition("/")
+        if kind == "grad_norm":
+            return np.asarray(np.linalg.norm(self.gradients[name].ravel())) if name in self.gradients else None
+        if kind == "buffer_sum":
+            return np.asarray(self.buffers[name].sum()) if name in self.buffers else None
+        return recorded_form(key, self.outputs)
 
 
 def read_case(path: str | Path) -> Case:

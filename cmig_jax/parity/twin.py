@@ -6,34 +6,14 @@ points `[B, 3, N]`, views `[B, V, 3, H, W]`, R `[B, 3, 3]`, t `[B, 3]`. Written 
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-
 import torch
 from torch import Tensor, nn
 
 from cmig_jax.parity import twin_losses
+from cmig_jax.parity.sizes import CREDIBILITY_WIDTH, Sizes
 from cmig_jax.parity.twin_attention import Transformer
 from cmig_jax.parity.twin_encoders import ImageEncoder, PointEncoder
 from cmig_jax.parity.twin_matching import ConvStack, PoseHead, coordinate_pairs, credibility, feature_pairs
-
-
-@dataclass(frozen=True)
-class Sizes:
-    """Sizes of the network; the defaults are the released ones."""
-
-    k: int = 20
-    widths: tuple[int, ...] = (64, 64, 64, 128)
-    dim: int = 512
-    image_widths: tuple[int, ...] = (64, 128, 256, 512)
-    image_blocks: tuple[int, ...] = (2, 2, 2, 2)
-    heads: int = 4
-    feed_forward: int = 1024
-    keypoints: int = 256
-    iterations: int = 3
-    score_widths: tuple[int, ...] = (512, 256, 128)
-    feature_widths: tuple[int, ...] = (256, 128, 64, 32, 32, 32)
-    coordinate_widths: tuple[int, ...] = (32, 32, 32)
-    credibility_width: int = 32
 
 
 class Twin(nn.Module):
@@ -54,11 +34,11 @@ class Twin(nn.Module):
         self.head = PoseHead()
         self.sim_mat_Fconv = nn.ModuleList([ConvStack(conv2, s.dim + 1, s.feature_widths, 1) for _ in n])
         self.sim_mat_Sconv = nn.ModuleList([ConvStack(conv2, 7, s.coordinate_widths, 1) for _ in n])
-        self.weight_fc = nn.ModuleList([ConvStack(conv1, s.credibility_width, (s.credibility_width,), 1) for _ in n])
-        self.preweight = nn.ModuleList([ConvStack(conv2, 2, (), s.credibility_width) for _ in n])
+        self.weight_fc = nn.ModuleList([ConvStack(conv1, CREDIBILITY_WIDTH, (CREDIBILITY_WIDTH,), 1) for _ in n])
+        self.preweight = nn.ModuleList([ConvStack(conv2, 2, (), CREDIBILITY_WIDTH) for _ in n])
         self.MVCNN = ImageEncoder(s.image_widths, s.image_blocks)
         self.attn = Transformer(s.dim, s.heads, s.feed_forward)
-        self.h3 = _score_network(2 * s.dim, s.score_widths)
+        self.h3 = _score_network(2 * s.dim, (s.dim, s.dim // 2, s.dim // 4))
 
     def forward(
         self,
@@ -80,7 +60,8 @@ class Twin(nn.Module):
             generator: source of the draw.
 
         Returns:
-            Every intermediate result under its recorded name; `R`, `t`; in training mode also `src_idx`, `loss_terms` and `loss`.
+            Every intermediate result under its recorded name, and `layer_<i>` `[2B, C_i, N]`, the point encoder's layers (source
+            clouds, then target clouds); `R`, `t`; in training mode also `src_idx`, `loss_terms` and `loss`.
         """
         out: dict[str, Tensor] = {}
         f_src, f_tgt = self._features(out, src, tgt, views)
@@ -108,7 +89,9 @@ class Twin(nn.Module):
 
     def _features(self, out: dict[str, Tensor], src: Tensor, tgt: Tensor, views: Tensor) -> tuple[Tensor, Tensor]:
         """Encode both modalities and fuse them: sections A and C."""
-        f_src, f_tgt = out["feat_src"], out["feat_tgt"] = self.emb_nn(torch.cat((src, tgt))).chunk(2)
+        features, layers = self.emb_nn(torch.cat((src, tgt)))
+        out |= {f"layer_{i}": layer for i, layer in enumerate(layers)}
+        f_src, f_tgt = out["feat_src"], out["feat_tgt"] = features.chunk(2)
         image = out["feat_views"] = self.MVCNN(views)
         a, b = out["attn_points_0"], out["attn_points_1"] = self.attn(f_src, f_tgt)
         f_src, f_tgt = f_src + a, f_tgt + b

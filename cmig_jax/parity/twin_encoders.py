@@ -23,14 +23,14 @@ class PointEncoder(nn.Module):
         for i, width in enumerate((*widths, dim), start=1):
             self.add_module(f"bn{i}", nn.BatchNorm2d(width))
 
-    def forward(self, points: Tensor) -> Tensor:
-        """Encode points `[B, 3, N]` as features `[B, dim, N]`."""
-        graph_of, linked = points, points
+    def forward(self, points: Tensor) -> tuple[Tensor, list[Tensor]]:
+        """Encode points `[B, 3, N]` as features `[B, dim, N]`; return also each layer's own output."""
+        linked = [points]
         for i in range(1, self.layers + 1):
-            edges = edge_features(linked, nearest_neighbors(graph_of, self.k))
-            graph_of = self._block(i, edges).amax(dim=-1)
-            linked = torch.cat((linked, graph_of), dim=1)
-        return self._block(self.layers + 1, linked.unsqueeze(-1)).squeeze(-1)
+            edges = edge_features(torch.cat(linked, dim=1), nearest_neighbors(linked[-1], self.k))
+            linked.append(self._block(i, edges).amax(dim=-1))
+        features = self._block(self.layers + 1, torch.cat(linked, dim=1).unsqueeze(-1)).squeeze(-1)
+        return features, linked[1:]
 
     def _block(self, i: int, x: Tensor) -> Tensor:
         return torch.relu(self.get_submodule(f"bn{i}")(self.get_submodule(f"conv{i}")(x)))

@@ -3,29 +3,15 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass, replace
+from dataclasses import replace
 
 import numpy as np
 import torch
 from numpy.typing import NDArray
 
-from cmig_jax.parity.recorded import Arrays, Case, Inputs, condensed, named_weights
-from cmig_jax.parity.twin import Sizes, Twin
-
-
-@dataclass(frozen=True)
-class TwinRun:
-    """What one pass of the twin gave, in numpy.
-
-    Attributes:
-        outputs: every intermediate result by name; in training mode also `loss_terms` and `loss`.
-        gradients: by parameter, those that have one; empty in evaluation mode.
-        buffers: running statistics after the pass.
-    """
-
-    outputs: Arrays
-    gradients: Arrays
-    buffers: Arrays
+from cmig_jax.parity.recorded import Arrays, Case, Inputs, Run, condensed, named_weights
+from cmig_jax.parity.sizes import Sizes
+from cmig_jax.parity.twin import Twin
 
 
 def make_twin(
@@ -43,7 +29,7 @@ def state_shapes(sizes: Sizes) -> dict[str, tuple[int, ...]]:
         return {name: tuple(tensor.shape) for name, tensor in Twin(sizes).state_dict().items()}
 
 
-def run_twin(twin: Twin, inputs: Inputs, train: bool, seed: int = 0) -> TwinRun:
+def run_twin(twin: Twin, inputs: Inputs, train: bool, seed: int = 0) -> Run:
     """Run forward, and in training mode backward; gradients are left on the twin's parameters.
 
     Args:
@@ -60,12 +46,16 @@ def run_twin(twin: Twin, inputs: Inputs, train: bool, seed: int = 0) -> TwinRun:
         out = twin(src, tgt, views, R_gt, t_gt, src_idx, torch.Generator().manual_seed(seed))
     gradients: Arrays = {}
     if train:
+        for value in out.values():
+            if value.requires_grad:
+                value.retain_grad()
         out["loss"].backward()
         gradients = {name: p.grad.numpy().copy() for name, p in twin.named_parameters() if p.grad is not None}
-    return TwinRun(
+    return Run(
         outputs={name: value.detach().numpy().copy() for name, value in out.items()},
         gradients=gradients,
         buffers={name: value.numpy().copy() for name, value in twin.named_buffers()},
+        cotangents={name: value.grad.numpy() for name, value in out.items() if value.retains_grad and value.grad is not None},
     )
 
 
@@ -73,7 +63,7 @@ def record_case(sizes: Sizes, inputs: Inputs, train: bool, seed: int, margins: t
     """Record a case in float64 with the weights that `seed` names."""
     twin = make_twin(sizes, named_weights(state_shapes(sizes), seed), margins=margins)
     run = run_twin(twin, inputs, train, seed)
-    outputs = dict(run.outputs)
+    outputs = {name: value for name, value in run.outputs.items() if not name.startswith("layer_")}
     if not train:
         return Case(replace(inputs, src_idx=None), outputs)
     drawn = outputs.pop("src_idx").astype(np.int32)

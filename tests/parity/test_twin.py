@@ -9,7 +9,8 @@ import pytest
 import torch
 
 from cmig_jax.parity.recorded import named_weights, random_inputs, read_case, recorded_form
-from cmig_jax.parity.twin import Sizes, Twin
+from cmig_jax.parity.sizes import Sizes
+from cmig_jax.parity.twin import Twin
 from cmig_jax.parity.twin_run import make_twin, record_case, run_twin, state_shapes
 
 torch.set_num_threads(1)
@@ -24,7 +25,6 @@ SMALL = Sizes(
     feed_forward=48,
     keypoints=12,
     iterations=2,
-    score_widths=(32, 16, 8),
     feature_widths=(16, 8),
     coordinate_widths=(8, 8),
 )

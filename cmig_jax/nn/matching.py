@@ -135,7 +135,8 @@ class PairLayer(nn.Module):
         centre = jnp.mean(b, axis=-2, keepdims=True)  # cancels in the difference, and would cost it digits
         difference = ((b - centre).astype(dtype) @ direction)[:, None] - ((a - centre).astype(dtype) @ direction)[:, :, None]
         distance = pair_distances(a, b)[..., None]
-        scale = (1 / (distance + 1e-8)).astype(dtype)
+        # No length, no direction: 1e-8 would blow up what rounding leaves of the difference.
+        scale = jnp.where(distance > 0, 1 / (distance + 1e-8), 0).astype(dtype)
         pairs = distance.astype(dtype) * channels(length, 4) + difference * (-scale if self.reverse else scale)
         return pairs if extra is None else pairs + (extra.astype(dtype) @ rest)[:, :, None]
 

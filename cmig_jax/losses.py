@@ -55,7 +55,8 @@ def cross_modal(points: Array, images: Array, temperature: float, include_positi
         include_positive: whether the positive stands in the denominator (NT-Xent) or not (Eq. 4, which can go below 0).
     """
     vectors = jnp.concatenate([points, images])
-    vectors = vectors / jnp.maximum(jnp.linalg.norm(vectors, axis=-1, keepdims=True), 1e-12)
+    square = jnp.sum(vectors**2, axis=-1, keepdims=True)
+    vectors = vectors / jnp.sqrt(jnp.where(square == 0, 1, square))  # a zero vector stays one; the root has no derivative there
     similarity = jnp.matmul(vectors, vectors.T, precision=jax.lax.Precision.HIGHEST) / temperature
     B = points.shape[0]
     partner = jnp.roll(jnp.arange(2 * B), B)

@@ -7,6 +7,7 @@ from typing import Any, Protocol
 
 import grain
 import numpy as np
+from absl import flags
 
 from cmig_jax.config import Config
 from cmig_jax.data.pairs import Pair, Pairs
@@ -47,6 +48,8 @@ def training_batches(pairs: Pairs, config: Config, *, process: int = 0, processe
     options = grain.ReadOptions(num_threads=0 if config.data.workers else 1, prefetch_buffer_size=2)
     stream = data.to_iter_dataset(options)
     if config.data.workers:
+        if not flags.FLAGS.is_parsed():
+            flags.FLAGS.mark_as_parsed()  # grain's workers read absl's flags, which no script of ours parses
         stream = stream.mp_prefetch(grain.MultiprocessingOptions(num_workers=config.data.workers))
     return iter(stream)
 

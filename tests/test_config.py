@@ -1,0 +1,115 @@
+"""The schema: what it writes it reads, and what it refuses it names."""
+
+import dataclasses
+import json
+import re
+
+import pytest
+
+from cmig_jax.config import Config, FusionConfig, ModelConfig, ViewsConfig, _rules, from_json, to_json
+
+REFUSED = {
+    "data.points": [0],
+    "data.keep": [0.0, 1.5, -0.1],
+    "data.noise_std": [-0.01],
+    "data.noise_clip": [-0.05],
+    "data.max_angle_deg": [-1.0, 181.0],
+    "data.validation": [0.0, 1.0],
+    "data.shapes": [3],
+    "views.count": [12, 0],
+    "views.size": [7],
+    "model.points.k": [0, 769],
+    "model.keypoints.count": [1, 769],
+    "model.image.widths": [(64, 128, 256, 511)],
+    "model.image.blocks": [(2, 2, 2)],
+    "model.fusion.heads": [0, 3],
+    "model.matching.iterations": [0],
+    "loss.temperature": [0.0],
+    "optim.batch": [1],
+    "optim.epochs": [0],
+    "optim.validate_every": [0],
+    "optim.learning_rate": [0.0],
+    "compute.rows": [-1],
+}
+
+
+def changed(config, flag, value):
+    """Replace one flag, named by its path."""
+    name, _, rest = flag.partition(".")
+    return dataclasses.replace(config, **{name: changed(getattr(config, name), rest, value) if rest else value})
+
+
+def edited(flag, edit):
+    """Write the default config as JSON with the object that holds `flag` edited."""
+    values = json.loads(to_json(Config()))
+    inner, path = values, flag.split(".")
+    for name in path[:-1]:
+        inner = inner[name]
+    edit(inner, path[-1])
+    return json.dumps(values)
+
+
+def test_json_round_trip_keeps_every_flag():
+    config = Config(name="mine", seed=7, views=ViewsConfig(count=12, layout="ring"), model=ModelConfig(fusion=FusionConfig(image="views")))
+    config = changed(config, "data.noise_std", 0.0)
+    assert from_json(to_json(config)) == config
+    assert from_json(to_json(config)) != Config()
+
+
+def test_sequences_come_back_as_tuples_so_that_configs_stay_hashable():
+    config = from_json(to_json(Config()))
+    assert config.model.points.widths == (64, 64, 64, 128)
+    assert hash(config) == hash(Config())
+
+
+@pytest.mark.parametrize(("flag", "value"), [(flag, value) for flag, values in REFUSED.items() for value in values])
+def test_a_refused_value_is_named_with_its_flag_and_what_was_expected(flag, value):
+    with pytest.raises(ValueError, match=re.escape(f"{flag} = {value}") + ".*: expected .+"):
+        changed(Config(), flag, value)
+
+
+def test_every_rule_is_tested_above():
+    ruled = {name.split(" = ")[0] for name, _, _ in _rules(Config())}
+    assert ruled == set(REFUSED) | {"model.fusion.image"}
+
+
+def test_tied_image_fusion_needs_the_transformer_whose_weights_it_shares():
+    with pytest.raises(ValueError, match=r"model\.fusion\.image = transformer with model\.fusion\.points = none"):
+        changed(Config(), "model.fusion", FusionConfig(points="none", image="transformer"))
+
+
+def test_rules_bind_only_where_the_flag_is_used():
+    no_views = changed(changed(Config(), "loss.cross_modal", "off"), "model.fusion.image", "none")
+    assert changed(no_views, "optim.batch", 1).optim.batch == 1
+    assert changed(no_views, "model.image.widths", (8, 8, 8, 8)).model.points.dim == 512
+    everything = changed(Config(), "model.keypoints.select", "all")
+    assert changed(everything, "model.keypoints.count", 100_000).model.keypoints.select == "all"
+    assert changed(changed(Config(), "data.crop", "none"), "model.keypoints.count", 1024).data.crop == "none"
+
+
+@pytest.mark.parametrize(("flag", "value"), [("data.crop", "half"), ("model.matching.head", 3), ("loss.overlap", True), ("views.of", None)])
+def test_a_value_outside_its_choices_is_named(flag, value):
+    text = edited(flag, lambda inner, name: inner.__setitem__(name, value))
+    with pytest.raises(ValueError, match=re.escape(f"config.{flag} = {value!r}: expected one of ")):
+        from_json(text)
+
+
+def test_unknown_and_missing_flags_are_named():
+    with pytest.raises(ValueError, match=r"config\.model\.points: unknown flags \['depth'\]"):
+        from_json(edited("model.points.depth", lambda inner, name: inner.__setitem__(name, 3)))
+    with pytest.raises(ValueError, match=r"config\.optim: .*missing flags \['batch'\]"):
+        from_json(edited("optim.batch", lambda inner, name: inner.pop(name)))
+
+
+def test_what_is_no_config_is_refused():
+    with pytest.raises(ValueError, match="expected JSON"):
+        from_json("{")
+    with pytest.raises(ValueError, match="expected an object of flags"):
+        from_json("[]")
+    with pytest.raises(ValueError, match=r"config\.data = 5: expected an object of flags"):
+        from_json(edited("data", lambda inner, name: inner.__setitem__(name, 5)))
+
+
+def test_reading_applies_the_rules():
+    with pytest.raises(ValueError, match=r"data\.keep = 2"):
+        from_json(edited("data.keep", lambda inner, name: inner.__setitem__(name, 2)))

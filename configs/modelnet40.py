@@ -57,5 +57,5 @@ def modelnet40_cpu() -> Config:
         small,
         name="modelnet40-cpu",
         data=DataConfig(source="modelnet40-hdf5", points=512, categories="first-half", test_categories="second-half"),
-        optim=OptimConfig(learning_rate=2e-3, weight_decay=1e-5, schedule="cosine", epochs=60, batch=16, clip_norm=5.0, validate_every=5),
+        optim=OptimConfig(learning_rate=2e-3, weight_decay=1e-5, schedule="cosine", epochs=24, batch=16, clip_norm=5.0, validate_every=4),
     )

@@ -25,7 +25,7 @@ def quickstart() -> Config:
         views=ViewsConfig(of="both", count=6, size=32, layout="axes"),
         model=small_network(),
         loss=LossConfig(cross_modal="nt-xent", overlap="off", match_mean="positive"),
-        optim=OptimConfig(learning_rate=2e-3, weight_decay=1e-5, schedule="cosine", epochs=20, batch=16, clip_norm=5.0, validate_every=4),
+        optim=OptimConfig(learning_rate=2e-3, weight_decay=1e-5, schedule="cosine", epochs=10, batch=16, clip_norm=5.0, validate_every=2),
     )
 
 

@@ -10,6 +10,7 @@ import optax
 from jax import Array
 
 from cmig_jax.config import LossConfig
+from cmig_jax.geometry.maximum import maximum
 from cmig_jax.geometry.neighbors import nearest, squared_distances
 from cmig_jax.structs import Batch, Iteration, Prediction, RigidTransform
 
@@ -133,7 +134,7 @@ def _present(value: T | None) -> T:
 
 
 def _cross_modal(prediction: Prediction, config: LossConfig) -> Array:
-    points = 0.5 * (jnp.max(prediction.source_features, axis=1) + jnp.max(prediction.target_features, axis=1))
+    points = 0.5 * (maximum(prediction.source_features, 1) + maximum(prediction.target_features, 1))
     images = jnp.mean(_present(prediction.image_features), axis=1).astype(points.dtype)
     return cross_modal(points, images, config.temperature, include_positive=config.cross_modal == "nt-xent")
 

@@ -11,6 +11,7 @@ import jax
 import jax.numpy as jnp
 from jax import Array
 
+from cmig_jax.geometry.maximum import maximum
 from cmig_jax.geometry.procrustes import weighted_procrustes
 from cmig_jax.nn.attention import PairTransformer
 from cmig_jax.nn.edgeconv import PointEncoder
@@ -78,7 +79,7 @@ class CMIGNet(nn.Module):
         return Prediction(
             source_features=source,
             target_features=target,
-            image_features=None if tokens is None else jnp.max(tokens, axis=2),
+            image_features=None if tokens is None else maximum(tokens, 2),
             source_fused=fused_source,
             target_fused=fused_target,
             source_scores=source_scores,
@@ -125,7 +126,7 @@ class CMIGNet(nn.Module):
         if self.image_fusion == "none" or tokens is None:
             return source, target
         if self.image_fusion != "views":
-            tokens = jnp.max(tokens, axis=2, keepdims=True)  # F_I; N equal tokens act as one
+            tokens = maximum(tokens, 2)[:, :, None]  # F_I; N equal tokens act as one
         of_source, of_target = (tokens[:, s].astype(source.dtype) for s in (0, -1))
         layer = self.transformer if self.image_fusion == "transformer" else self.cross_attention
         assert layer is not None
@@ -135,7 +136,7 @@ class CMIGNet(nn.Module):
         """Score the points that each cloud's keypoints are picked by (Sec. III-D)."""
         if self.score is None:
             return None, None
-        of_source, of_target = self.score(source, jnp.max(target, axis=1)), self.score(target, jnp.max(source, axis=1))
+        of_source, of_target = self.score(source, maximum(target, 1)), self.score(target, maximum(source, 1))
         return (of_target, of_source) if self.score_from == "other" else (of_source, of_target)
 
     def _keypoints(self, batch: Batch, source_scores: Array | None, target_scores: Array | None, key: Array | None) -> Keypoints:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import json
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any, Literal
 
@@ -59,6 +60,7 @@ def evaluate_run(
         "ICP (cutoff 0.02)": one_by_one(baselines.icp_cutoff),
         "ICP (tuned)": one_by_one(baselines.icp_tuned),
         "CMIGNet": network,
+        "CMIGNet + ICP": lambda chunk: refined(network, chunk),
     }
     folder = run / out
     settings = json.loads(to_json(config)) | {"checkpoint": {"which": which, "step": network.step}}
@@ -67,6 +69,13 @@ def evaluate_run(
     print(text_table(results))
     print(f"results and pictures are in {folder}")
     return results
+
+
+def refined(network: Network, pairs: Sequence[Mapping[str, Any]]) -> tuple[np.ndarray, np.ndarray]:
+    """Register pairs by the network, then by point-to-point ICP from its poses: R `[n, 3, 3]`, t `[n, 3]`."""
+    starts = zip(*network(pairs), strict=True)
+    poses = [baselines.icp(p["source"], p["target"], max_distance=0.1, start=start) for p, start in zip(pairs, starts, strict=True)]
+    return np.stack([R for R, _ in poses]), np.stack([t for _, t in poses])
 
 
 def pairs_to_test(config: Config, limit: int | None = None) -> Pairs:

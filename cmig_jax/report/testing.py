@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import json
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any, Literal
 
@@ -60,7 +60,7 @@ def evaluate_run(
         "ICP (cutoff 0.02)": one_by_one(baselines.icp_cutoff),
         "ICP (tuned)": one_by_one(baselines.icp_tuned),
         "CMIGNet": network,
-        "CMIGNet + ICP": lambda chunk: refined(network, chunk),
+        "CMIGNet + ICP": lambda chunk: refined(network, [dict(pair) for pair in chunk]),
     }
     folder = run / out
     settings = json.loads(to_json(config)) | {"checkpoint": {"which": which, "step": network.step}}
@@ -71,7 +71,7 @@ def evaluate_run(
     return results
 
 
-def refined(network: Network, pairs: Sequence[Mapping[str, Any]]) -> tuple[np.ndarray, np.ndarray]:
+def refined(network: Network, pairs: Sequence[Pair]) -> tuple[np.ndarray, np.ndarray]:
     """Register pairs by the network, then by point-to-point ICP from its poses: R `[n, 3, 3]`, t `[n, 3]`."""
     starts = zip(*network(pairs), strict=True)
     poses = [baselines.icp(p["source"], p["target"], max_distance=0.1, start=start) for p, start in zip(pairs, starts, strict=True)]

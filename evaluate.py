@@ -34,23 +34,32 @@ class Command:
     """Name of the folder, inside the run folder, that the results go to."""
 
 
-def main() -> int:
-    """Parse the command line, evaluate, print the table."""
-    arguments = sys.argv[1:]
+def main(arguments: list[str] | None = None) -> int:
+    """Parse the command line, evaluate, print the table, and return the exit code: 0, 2 for bad input, 130 when interrupted."""
+    arguments = sys.argv[1:] if arguments is None else arguments
     try:
-        # The run's own config gives the defaults of the data flags.
-        config = read_config(Path(arguments[0])) if arguments and not arguments[0].startswith("-") else Config()
-        command = tyro.cli(Command, default=Command(run=Path("RUN_FOLDER"), data=config.data))
-        config = dataclasses.replace(config, data=command.data)
+        command, config = parse(arguments)
         typed = shlex.join(["python", "evaluate.py", *arguments])
         evaluate_run(command.run, config, typed, which=command.which, limit=command.limit, batch=command.batch, out=command.out)
-    except ValueError as error:
-        print(f"error: {error}")
+    except (ValueError, OSError) as error:
+        print(f"error: {error}", file=sys.stderr)
         return 2
     except KeyboardInterrupt:
-        print("stopped; the same command continues")
+        print("stopped; the same command continues", file=sys.stderr)
         return 130
     return 0
+
+
+def parse(arguments: list[str]) -> tuple[Command, Config]:
+    """Parse the flags twice: for the run folder, then with the run's own config as the defaults of the data flags."""
+    without_help = [argument for argument in arguments if argument not in ("-h", "--help")]
+    default = Command(run=Path("RUN_FOLDER"), data=DataConfig())
+    run = tyro.cli(Command, args=without_help, default=default).run
+    if run == default.run:
+        return tyro.cli(Command, args=arguments, default=default), read_config(run)
+    config = read_config(run)
+    command = tyro.cli(Command, args=arguments, default=Command(run=run, data=config.data))
+    return command, dataclasses.replace(config, data=command.data)
 
 
 if __name__ == "__main__":

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import sys
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated
@@ -26,25 +27,29 @@ class Command:
     """Devices to use; by default the most that divide the batch."""
 
 
-def main(command: Command) -> int:
-    """Run a command and return its exit code."""
-    config = command.config
+def main(arguments: list[str] | None = None) -> int:
+    """Parse the command line, train, return the exit code: 0, 1 for a loss that is not finite, 2 for bad input, 130 when interrupted."""
+    presets = {name: Command(config=preset()) for name, preset in PRESETS.items()}
+    descriptions = {name: preset.__doc__ or "" for name, preset in PRESETS.items()}
+    chosen = tyro.extras.subcommand_type_from_defaults(presets, descriptions)
     try:
-        train(config, command.runs / config.name, resume=command.resume, devices=command.devices)
-    except ValueError as error:
-        print(f"error: {error}")
+        # Flags that exclude each other are found when the config is made, inside tyro.
+        command: Command = tyro.cli(chosen, args=arguments, config=(tyro.conf.ConsolidateSubcommandArgs,))
+        train(command.config, command.runs / command.config.name, resume=command.resume, devices=command.devices)
+    except (ValueError, OSError) as error:
+        print(f"error: {error}", file=sys.stderr)
         return 2
     except NonFiniteLoss as error:
-        print(f"stopped: {error}")
+        print(f"stopped: {error}", file=sys.stderr)
         return 1
     except Interrupted as error:
-        print(error)
+        print(error, file=sys.stderr)
+        return 130
+    except KeyboardInterrupt:
+        print("stopped at once; --resume continues from the last checkpoint", file=sys.stderr)
         return 130
     return 0
 
 
 if __name__ == "__main__":
-    presets = {name: Command(config=preset()) for name, preset in PRESETS.items()}
-    descriptions = {name: preset.__doc__ or "" for name, preset in PRESETS.items()}
-    chosen = tyro.extras.subcommand_type_from_defaults(presets, descriptions)
-    raise SystemExit(main(tyro.cli(chosen, config=(tyro.conf.ConsolidateSubcommandArgs,))))
+    raise SystemExit(main())

@@ -105,13 +105,16 @@ def register(
 
     Raises:
         ValueError: a cloud that is empty, not `[N, 3]` numbers, not finite, with all points on one line, or with fewer points than the
-            network's neighbours or keypoints; a network that needs images of complete objects, or clouds of equal size, and has none.
+            network's neighbours or keypoints; `points` below these; a network that needs images of complete objects, or clouds of equal
+            size, and has none.
     """
     network = _pretrained() if network is None else network
     x, y = _cloud(source, "source", network.config), _cloud(target, "target", network.config)
     centre_x, centre_y = x.mean(axis=0), y.mean(axis=0)
     scale = max(np.linalg.norm(x - centre_x, axis=1).max(), np.linalg.norm(y - centre_y, axis=1).max())
     count = network.points if points is None else points
+    if count < (fewest := _fewest_points(network.config)):
+        raise ValueError(f"points = {count}: expected at least {fewest}, the network's neighbours and keypoints")
     pair = {
         "source": _thinned((x - centre_x) / scale, count, seed=0).astype(np.float32),
         "target": _thinned((y - centre_y) / scale, count, seed=1).astype(np.float32),
@@ -128,21 +131,30 @@ def register(
 def _cloud(points: ArrayLike, name: str, config: Config) -> Floats:
     """Check a user's cloud."""
     try:
-        cloud = np.asarray(points, np.float64)
-    except (TypeError, ValueError) as error:
+        given = np.asarray(points)
+    except ValueError as error:
         raise ValueError(f"{name}: expected numbers [N, 3] ({error})") from error
+    if given.dtype.kind not in "iuf":
+        raise ValueError(f"{name} has dtype {given.dtype}: expected numbers [N, 3]")
+    cloud = given.astype(np.float64)
     if cloud.ndim != 2 or cloud.shape[1] != 3:
         raise ValueError(f"{name} has shape {cloud.shape}: expected [N, 3]")
-    fewest = max(config.model.points.k, 3 if config.model.keypoints.select == "all" else config.model.keypoints.count)
+    fewest = _fewest_points(config)
     if len(cloud) < fewest:
         raise ValueError(f"{name} has {len(cloud)} points: expected at least {fewest}, the network's neighbours and keypoints")
     bad = np.flatnonzero(~np.isfinite(cloud).all(axis=1))
     if len(bad):
         raise ValueError(f"{name}[{bad[0]}] = {cloud[bad[0]]}: expected finite coordinates ({len(bad)} points are not)")
     spread = np.linalg.svd(cloud - cloud.mean(axis=0), compute_uv=False)
-    if spread[1] <= 1e-9 * max(spread[0], np.abs(cloud).max()):
+    rounding = np.finfo(given.dtype).eps if given.dtype.kind == "f" else 0.0
+    if spread[1] <= max(1e-9, 16 * rounding) * max(spread[0], np.abs(cloud).max()):
         raise ValueError(f"{name}: all points are equal or on one line, which leaves the rotation open; expected a surface")
     return cloud
+
+
+def _fewest_points(config: Config) -> int:
+    keypoints = config.model.keypoints
+    return max(config.model.points.k, 3 if keypoints.select == "all" else keypoints.count)
 
 
 def _thinned(cloud: Floats, count: int, seed: int) -> Floats:

@@ -2,9 +2,14 @@
 
 from __future__ import annotations
 
+import contextlib
+import gc
 import json
+import logging
 import math
 import os
+import sys
+from collections.abc import Iterator
 from pathlib import Path
 from typing import Any, Literal
 
@@ -21,8 +26,9 @@ class Checkpoints:
     def __init__(self, run: Path) -> None:
         policies = ocp.training.preservation_policies
         best = policies.BestN(get_metric_fn=_rank, n=1, keep_checkpoints_without_metrics=False)
+        self._folder = (run / "checkpoints").absolute()
         self._checkpointer: Any = ocp.training.Checkpointer(
-            str((run / "checkpoints").absolute()),
+            str(self._folder),
             preservation_policy=policies.AnyPreservationPolicy([policies.LatestN(1), best]),  # pyright: ignore[reportArgumentType]
             cleanup_tmp_directories=True,
         )
@@ -39,9 +45,10 @@ class Checkpoints:
         latest = self._checkpointer.latest
         if latest is None:
             return None
-        metadata = self._checkpointer.metadata(latest.step)
+        with _silent("absl", "asyncio"):
+            metadata = self._checkpointer.metadata(latest.step)
         assert isinstance(metadata.custom_metadata, dict)
-        return self._checkpointer.load(latest.step, like), metadata.custom_metadata["iterator"]
+        return _load(self._checkpointer, self._folder, latest.step, like), metadata.custom_metadata["iterator"]
 
     def close(self) -> None:
         """Finish writing."""
@@ -58,14 +65,20 @@ def write_config(run: Path, config: Config) -> None:
     Raises:
         ValueError: the folder is of another config; the message names the flags that differ.
     """
-    path = run / "config.json"
-    if path.exists():
-        changed = differences(read_config(run), config)
-        if changed:
-            raise ValueError(f"{path} is of another config ({'; '.join(changed)}): choose another --name, or remove the folder")
-        return
+    check_config(run, config)
     run.mkdir(parents=True, exist_ok=True)
-    write_atomically(path, to_json(config))
+    write_atomically(run / "config.json", to_json(config))
+
+
+def check_config(run: Path, config: Config) -> None:
+    """Refuse a run folder of another config; one without a config is fine.
+
+    Raises:
+        ValueError: the message names the flags that differ.
+    """
+    path = run / "config.json"
+    if path.exists() and (changed := differences(read_config(run), config)):
+        raise ValueError(f"{path} is of another config ({'; '.join(changed)}): choose another --name, or remove the folder")
 
 
 def read_config(run: Path) -> Config:
@@ -121,7 +134,34 @@ def load_state(run: Path, like: Any, which: Literal["best", "last"] = "best") ->
         if not found:
             raise ValueError(f"{folder}: expected a checkpoint, found none (has train.py run long enough to save one?)")
         chosen = max(found, key=lambda c: (_rank(c.metrics) if which == "best" else 0, c.step))
+        return _load(checkpointer, folder, chosen.step, like)
+
+
+def _load(checkpointer: Any, folder: Path, step: int, like: Any) -> Any:
+    """Load one checkpoint; where it fails, say why once: Orbax names the last handler that it tried, and logs what every task met."""
+    with _silent("absl", "asyncio"):
         try:
-            return checkpointer.load(chosen.step, like)
+            return checkpointer.load(step, like)
         except (ValueError, KeyError, OSError) as error:
-            raise ValueError(f"{folder}, step {chosen.step}: expected a checkpoint of the network in config.json ({error})") from error
+            cause: BaseException = error
+            while cause.__cause__ is not None:
+                cause = cause.__cause__
+            text = (str(cause).splitlines() or [type(cause).__name__])[0][:300]
+            del cause
+        gc.collect()  # the tasks that were dropped speak up when they are collected
+    raise ValueError(f"{folder}, step {step}: expected a whole checkpoint of the network in config.json ({text})")
+
+
+@contextlib.contextmanager
+def _silent(*names: str) -> Iterator[None]:
+    loggers = [logging.getLogger(name) for name in names]
+    levels, hook = [logger.level for logger in loggers], sys.unraisablehook
+    sys.unraisablehook = lambda _: None
+    for logger in loggers:
+        logger.setLevel(logging.CRITICAL + 1)
+    try:
+        yield
+    finally:
+        sys.unraisablehook = hook
+        for logger, level in zip(loggers, levels, strict=True):
+            logger.setLevel(level)

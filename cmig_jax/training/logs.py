@@ -23,11 +23,16 @@ class Log:
         write_atomically(self.path, "".join(line + "\n" for line in kept))
         self._writer = SummaryWriter(str(run / "tensorboard"), purge_step=step + 1)
         self._bar = tqdm(total=total, initial=step, unit="step", disable=not progress, smoothing=0.05, dynamic_ncols=True)
+        self._compiled = step == total
+        if not self._compiled:
+            self._bar.set_postfix_str("compiling the first step")
 
-    def advance(self, loss: float | None) -> None:
+    def advance(self, loss: float) -> None:
         """Move the bar by one step."""
-        if loss is not None:
-            self._bar.set_postfix(loss=f"{loss:.3f}", refresh=False)
+        if not self._compiled:
+            self._compiled = True
+            self._bar.unpause()  # the time to compile is not a step's
+        self._bar.set_postfix(loss=f"{loss:.3f}", refresh=False)
         self._bar.update(1)
 
     def write(self, step: int, values: Mapping[str, float]) -> None:

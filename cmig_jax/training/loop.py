@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 import signal
 import threading
 import time
@@ -22,7 +23,7 @@ from cmig_jax.data.prepare import ensure_prepared
 from cmig_jax.data.shards import Shards, check_settings
 from cmig_jax.metrics import registration_metrics
 from cmig_jax.nn.build import build, uses_images
-from cmig_jax.training.checkpoint import MEASURE, Checkpoints, write_config
+from cmig_jax.training.checkpoint import MEASURE, Checkpoints, check_config, write_config
 from cmig_jax.training.logs import Log
 from cmig_jax.training.mesh import device_mesh, to_device
 from cmig_jax.training.optim import optimizer, schedule
@@ -65,9 +66,8 @@ def train(config: Config, run: Path, *, resume: bool = False, progress: bool = T
     """
     if not resume and (run / "checkpoints").exists():
         raise ValueError(f"{run} holds a run: add --resume to continue it, or choose another --name")
-    data = training_data(config)
-    write_config(run, config)
-    _Run(config, run, data, devices).go(progress)
+    check_config(run, config)
+    _Run(config, run, training_data(config), devices).go(progress)
 
 
 def training_data(config: Config) -> TrainingData:
@@ -93,6 +93,7 @@ class _Run:
         self.mesh: Mesh = device_mesh(config.optim.batch, devices)
         self.batches: BatchIterator = training_batches(data.train, config, process=jax.process_index(), processes=jax.process_count())
         model, rule = build(config), optimizer(config.optim, self.epoch_steps)
+        write_config(folder, config)  # now that flags, data and devices fit each other
         self.checkpoints = Checkpoints(folder)
         restored = self.checkpoints.restore_last(abstract_state(model, rule, config, self.mesh))
         if restored is None:
@@ -192,6 +193,7 @@ def _stop_signals() -> Iterator[threading.Event]:
         del number, frame
         stop.set()
         restore()
+        os.write(2, b"\nstopping after this step; once more to stop at once\n")  # print is not safe in a signal handler
 
     for number in before:
         signal.signal(number, handle)

@@ -92,7 +92,7 @@ def make_step(model: CMIGNet, optimizer: optax.GradientTransformation, config: C
     def step(state: TrainState, batch: Batch) -> tuple[TrainState, dict[str, Array]]:
         key = jax.random.fold_in(jax.random.key(config.seed), state.step)
         (loss, (terms, batch_stats)), gradient = jax.value_and_grad(loss_function, has_aux=True)(state.params, state, batch, key)
-        norm = optax.global_norm(gradient)
+        norm = optax.tree.norm(gradient)
         updates, opt_state = optimizer.update(gradient, state.opt_state, state.params)
         changed = TrainState(
             step=state.step, params=optax.apply_updates(state.params, updates), batch_stats=batch_stats, opt_state=opt_state

@@ -1,0 +1,104 @@
+"""`evaluate.py`, as it is typed."""
+
+import json
+import shutil
+
+import matplotlib.image
+import numpy as np
+import pytest
+
+from cmig_jax.data.pairs import in_categories
+
+METRICS = {"rmse_r_deg", "mae_r_deg", "rmse_t", "mae_t", "iso_r_deg_median", "recall", "closest_point", "seconds_per_pair"}
+METHODS = {"identity", "ICP (cutoff 0.02)", "ICP (tuned)", "CMIGNet"}
+
+
+@pytest.fixture(scope="module")
+def evaluated(command_line, trained):
+    run, _ = trained
+    return run, command_line("evaluate.py", run, "--limit", 4, "--batch", 4)
+
+
+@pytest.fixture(scope="module")
+def results(evaluated):
+    run, finished = evaluated
+    assert finished.returncode == 0, finished.stderr
+    return json.loads((run / "evaluation" / "results.json").read_text())
+
+
+def assert_one_line(finished, message):
+    assert finished.returncode == 2
+    assert finished.stdout == ""
+    assert finished.stderr.startswith("error: ")
+    assert finished.stderr.count("\n") == 1
+    assert message in finished.stderr
+
+
+def test_results_name_every_method_and_metric(results):
+    assert set(results) >= METHODS | {"command", "config", "versions"}
+    for method in METHODS:
+        assert set(results[method]) >= METRICS
+        assert results[method]["pairs"] == 4
+        assert np.isfinite([results[method][name] for name in METRICS]).all()
+
+
+def test_results_hold_what_made_them(results, evaluated, tiny):
+    assert results["command"] == f"python evaluate.py {evaluated[0]} --limit 4 --batch 4"
+    assert results["config"]["data"]["points"] == tiny.data.points
+    assert results["config"]["checkpoint"] == {"which": "best", "step": 4}
+
+
+def test_the_table_is_printed_and_nothing_is_left_over(evaluated):
+    run, finished = evaluated
+    assert all(method in finished.stdout for method in METHODS)
+    assert f"{run}/evaluation" in finished.stdout
+    assert sorted(path.name for path in (run / "evaluation").iterdir()) == [
+        "curve.png", "errors.npz", "pairs.png", "results.json", "views.png"
+    ]  # fmt: skip
+
+
+@pytest.mark.parametrize("name", ["pairs", "views", "curve"])
+def test_the_pictures_show_something(evaluated, name):
+    pixels = matplotlib.image.imread(evaluated[0] / "evaluation" / f"{name}.png")[..., :3]
+    assert min(pixels.shape[:2]) >= 100
+    assert len(np.unique((pixels * 255).astype(np.uint8).reshape(-1, 3), axis=0)) > 20
+
+
+def test_help_shows_the_run_s_own_data_flags(main, trained):
+    finished = main("evaluate.py", trained[0], "--help")
+    assert finished.returncode == 0
+    for flag in ("--which", "--limit", "--batch", "--out", "--data.test-categories", "--data.noise-std"):
+        assert flag in finished.stdout
+    assert "(default: 48)" in finished.stdout, "the run's number of points, not the schema's"
+
+
+def test_flags_may_stand_before_the_run_folder(main, trained):
+    finished = main("evaluate.py", "--data.noise-std", -1, trained[0])
+    assert_one_line(finished, "data.noise_std = -1.0: expected 0 or more")
+
+
+def test_a_folder_that_is_no_run_is_one_line_of_error(main, tmp_path):
+    assert_one_line(main("evaluate.py", tmp_path), f"{tmp_path}: expected a run folder")
+
+
+def test_a_run_without_a_checkpoint_is_one_line_of_error(main, trained, tmp_path):
+    shutil.copy(trained[0] / "config.json", tmp_path)
+    assert_one_line(main("evaluate.py", tmp_path), f"{tmp_path}/checkpoints: expected checkpoints")
+    assert [path.name for path in tmp_path.iterdir()] == ["config.json"]
+
+
+def test_no_pairs_is_one_line_of_error(main, trained):
+    assert_one_line(main("evaluate.py", trained[0], "--limit", 0), "limit = 0: expected at least 1 pair")
+
+
+def test_a_wrong_flag_names_the_nearest(main, trained):
+    finished = main("evaluate.py", trained[0], "--limt", 4)
+    assert finished.returncode == 2
+    assert "--limit" in finished.stderr
+
+
+def test_the_halves_of_the_categories_share_no_object():
+    labels = np.array([0, 3, 1, 2, 2, 0])
+    first, second = (in_categories(labels, 4, half) for half in ("first-half", "second-half"))
+    assert first.tolist() == [0, 2, 5]
+    assert second.tolist() == [1, 3, 4]

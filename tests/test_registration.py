@@ -1,0 +1,212 @@
+"""Registering a user's clouds: of any size and unit, and every kind of cloud or network that cannot be."""
+
+import dataclasses
+import json
+
+import jax
+import numpy as np
+import pytest
+from scipy.spatial.transform import Rotation
+
+from cmig_jax.nn.build import build
+from cmig_jax.registration import Network, load, register
+from cmig_jax.training.checkpoint import Checkpoints, write_config
+from cmig_jax.training.mesh import device_mesh
+from cmig_jax.training.optim import optimizer
+from cmig_jax.training.predict import Predictor
+from cmig_jax.training.state import create_state
+
+FEWEST = 16  # the tiny network's keypoints
+
+
+@pytest.fixture(scope="module")
+def state(tiny):
+    return create_state(build(tiny), optimizer(tiny.optim, 1), tiny, device_mesh(1, 1))
+
+
+@pytest.fixture(scope="module")
+def network(tiny, state) -> Network:
+    """A network that has learnt nothing: what registration promises does not depend on that."""
+    return Network(config=tiny, variables=state.variables, predictor=Predictor(build(tiny), 1), step=0)
+
+
+@pytest.fixture(scope="module")
+def clouds_of_two_sizes():
+    rng = np.random.default_rng(0)
+    surface = rng.normal(size=(90, 3)) * [1, 0.6, 0.3]
+    R = Rotation.from_euler("zyx", [20, 10, 30], degrees=True).as_matrix()
+    return surface[:70], surface @ R.T + [0.3, -0.2, 0.1]
+
+
+@pytest.fixture(scope="module")
+def pose(network, clouds_of_two_sizes):
+    return register(*clouds_of_two_sizes, network)
+
+
+def assert_rotation(R):
+    assert R.shape == (3, 3)
+    np.testing.assert_allclose(R @ R.T, np.eye(3), atol=1e-5)
+    assert np.linalg.det(R) == pytest.approx(1, abs=1e-5)
+
+
+def test_clouds_of_different_size_give_a_rotation_and_a_translation(pose):
+    assert_rotation(pose.R)
+    assert pose.t.shape == (3,)
+    assert np.isfinite(pose.t).all()
+    assert isinstance(pose.R, np.ndarray)
+
+
+def test_the_same_clouds_give_the_same_pose_and_are_left_alone(network, clouds_of_two_sizes, pose):
+    before = [cloud.copy() for cloud in clouds_of_two_sizes]
+    again = register(*clouds_of_two_sizes, network)
+    np.testing.assert_array_equal(again.R, pose.R)
+    np.testing.assert_array_equal(again.t, pose.t)
+    for cloud, copy in zip(clouds_of_two_sizes, before, strict=True):
+        np.testing.assert_array_equal(cloud, copy)
+
+
+@pytest.mark.parametrize("scale", [0.25, 1024.0])
+def test_another_unit_scales_the_translation_alone(network, clouds_of_two_sizes, pose, scale):
+    # A power of two scales floating-point numbers without rounding, so no correspondence can change.
+    source, target = clouds_of_two_sizes
+    found = register(source * scale, target * scale, network)
+    np.testing.assert_allclose(found.R, pose.R, atol=1e-6)
+    np.testing.assert_allclose(found.t, pose.t * scale, atol=1e-6 * scale)
+
+
+def test_moving_the_clouds_moves_the_pose_with_them(network, pose, clouds_of_two_sizes):
+    # Coordinates that are multiples of 2^-20 are added without rounding.
+    source, target = (np.round(cloud * 2**20) / 2**20 for cloud in clouds_of_two_sizes)
+    still = register(source, target, network)
+    from_there, to_there = np.array([16.0, -8.0, 4.0]), np.array([-2.0, 0.0, 32.0])
+    moved = register(source + from_there, target + to_there, network)
+    np.testing.assert_allclose(moved.R, still.R, atol=1e-5)
+    np.testing.assert_allclose(moved.t, still.t + to_there - still.R @ from_there, atol=1e-3)
+
+
+@pytest.mark.parametrize("kind", [np.float32, np.float16, "list"])
+def test_any_numbers_will_do(network, clouds_of_two_sizes, kind):
+    source, target = (cloud.tolist() if kind == "list" else cloud.astype(kind) for cloud in clouds_of_two_sizes)
+    assert_rotation(register(source, target, network).R)
+
+
+def test_whole_numbers_and_planes_register(network):
+    grid = np.stack(np.meshgrid(np.arange(9), np.arange(7), [5]), axis=-1).reshape(-1, 3)
+    assert_rotation(register(grid, grid, network).R)
+
+
+def test_more_points_than_the_network_knows_are_thinned_to_its_number_or_the_users(network, clouds_of_two_sizes, monkeypatch):
+    sizes = []
+
+    def record(self, pairs):
+        sizes.append((len(pairs[0]["source"]), len(pairs[0]["target"])))
+        return np.eye(3)[None], np.zeros((1, 3))
+
+    monkeypatch.setattr(Network, "__call__", record)
+    source, target = clouds_of_two_sizes
+    register(source, target, network)
+    register(source, target, network, points=80)
+    register(source[:20], target, network, points=80)
+    assert sizes == [(network.points, network.points), (70, 80), (20, 80)]
+    assert network.points == 36
+
+
+@pytest.mark.parametrize("points", [0, -1, FEWEST - 1])
+def test_thinning_to_fewer_points_than_the_network_needs_is_refused(network, clouds_of_two_sizes, points):
+    with pytest.raises(ValueError, match=f"points = {points}: expected at least {FEWEST}"):
+        register(*clouds_of_two_sizes, network, points=points)
+
+
+def test_refinement_sharpens_a_pose_that_is_close(network, clouds_of_two_sizes, monkeypatch):
+    monkeypatch.setattr(Network, "__call__", lambda self, pairs: (np.eye(3)[None], np.zeros((1, 3))))
+    target = clouds_of_two_sizes[1]
+    R = Rotation.from_euler("z", 1, degrees=True).as_matrix()
+    source = (target - target.mean(axis=0)) @ R.T
+    found = register(source, target, network, refine=True)
+    np.testing.assert_allclose(source @ found.R.T + found.t, target, atol=1e-3)
+
+
+def line(points):
+    return np.linspace([0, 0, 0], [1, 2, 3], points) + 7
+
+
+def with_value(value):
+    cloud = np.random.default_rng(1).normal(size=(40, 3))
+    cloud[5, 2] = value
+    return cloud
+
+
+BAD = {
+    "empty": (np.zeros((0, 3)), "has 0 points: expected at least 16"),
+    "no points at all": ([], r"has shape \(0,\): expected \[N, 3\]"),
+    "fewer points than keypoints": (np.random.default_rng(0).normal(size=(15, 3)), "has 15 points: expected at least 16"),
+    "nan": (with_value(np.nan), r"\[5\] = .*nan.*: expected finite coordinates \(1 points are not\)"),
+    "infinite": (with_value(np.inf), r"\[5\] = .*inf.*: expected finite"),
+    "two coordinates": (np.ones((40, 2)), r"has shape \(40, 2\): expected \[N, 3\]"),
+    "a batch": (np.ones((1, 40, 3)), r"has shape \(1, 40, 3\): expected \[N, 3\]"),
+    "ragged": ([[1.0, 2.0, 3.0], [1.0, 2.0]], r"expected numbers \[N, 3\]"),
+    "strings": (np.full((40, 3), "a"), r"has dtype <U1: expected numbers \[N, 3\]"),
+    "strings of digits": (np.full((40, 3), "1"), r"expected numbers \[N, 3\]"),
+    "complex": (np.full((40, 3), 1j), r"expected numbers \[N, 3\]"),
+    "none": (None, "expected"),
+    "all points equal": (np.full((40, 3), 2.5), "all points are equal or on one line"),
+    "collinear": (line(40), "all points are equal or on one line"),
+    "collinear in single precision": (line(40).astype(np.float32), "all points are equal or on one line"),
+}
+
+
+@pytest.mark.parametrize("name", BAD)
+@pytest.mark.parametrize("which", ["source", "target"])
+def test_a_bad_cloud_is_refused_by_its_name_and_value(network, clouds_of_two_sizes, name, which):
+    cloud, message = BAD[name]
+    clouds = dict(zip(("source", "target"), clouds_of_two_sizes, strict=True)) | {which: cloud}
+    with pytest.raises(ValueError, match=f"{which}.*{message}"):
+        register(clouds["source"], clouds["target"], network)
+
+
+def test_fewer_points_than_neighbours_are_refused(network, clouds_of_two_sizes):
+    model = dataclasses.replace(network.config.model, points=dataclasses.replace(network.config.model.points, k=30))
+    hungry = dataclasses.replace(network, config=dataclasses.replace(network.config, model=model))
+    with pytest.raises(ValueError, match="source has 29 points: expected at least 30"):
+        register(clouds_of_two_sizes[0][:29], clouds_of_two_sizes[1], hungry)
+
+
+def test_a_network_of_complete_objects_views_says_what_it_needs(network, clouds_of_two_sizes):
+    config = dataclasses.replace(network.config, views=dataclasses.replace(network.config.views, of="object"))
+    with pytest.raises(ValueError, match=r"complete object \(views\.of=object\).*train with views\.of=both"):
+        register(*clouds_of_two_sizes, dataclasses.replace(network, config=config))
+
+
+def test_a_loaded_network_registers_like_the_one_that_was_saved(tiny, state, network, clouds_of_two_sizes, pose, tmp_path):
+    write_config(tmp_path, tiny)
+    checkpoints = Checkpoints(tmp_path)
+    checkpoints.save(3, state.replace(step=state.step + 3), {}, None)
+    checkpoints.close()
+    loaded = load(tmp_path)
+    assert loaded.config == tiny
+    assert loaded.step == 3
+    jax.tree.map(np.testing.assert_array_equal, dict(loaded.variables), dict(network.variables))
+
+
+def test_a_run_folder_that_does_not_exist_is_named(tmp_path):
+    with pytest.raises(ValueError, match=f"{tmp_path}/nowhere: expected a run folder"):
+        load(tmp_path / "nowhere")
+
+
+def test_a_run_folder_without_a_checkpoint_is_named(tiny, tmp_path):
+    write_config(tmp_path, tiny)
+    with pytest.raises(ValueError, match=f"{tmp_path}/checkpoints: expected checkpoints"):
+        load(tmp_path)
+
+
+@pytest.mark.parametrize("damage", ["", "{", "[1]", "other version", "other value"])
+def test_a_run_folder_with_a_damaged_config_is_named(tiny, tmp_path, damage):
+    write_config(tmp_path, tiny)
+    path = tmp_path / "config.json"
+    values = json.loads(path.read_text())
+    if damage == "other version":
+        del values["optim"]
+    values["views"] |= {"of": "everything"} if damage == "other value" else {}
+    path.write_text(json.dumps(values) if damage.startswith("other") else damage)
+    with pytest.raises(ValueError, match=f"{path}: config"):
+        load(tmp_path)

@@ -1,0 +1,163 @@
+"""Run folders: what is saved comes back, what does not fit is refused by name."""
+
+import dataclasses
+import shutil
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from cmig_jax.config import Config
+from cmig_jax.training.checkpoint import MEASURE, Checkpoints, differences, load_state, read_config, write_config
+from cmig_jax.training.mesh import device_mesh, replicated
+from cmig_jax.training.state import TrainState
+
+POSITION = {"next_index": 12, "shards": [1, 2]}
+
+
+def make_state(value, devices=1, width=3):
+    """A state of a network that is one layer."""
+    sharding = replicated(device_mesh(8, devices))
+    state = TrainState(
+        step=jnp.asarray(value, jnp.int32),
+        params={"layer": {"kernel": jnp.full((width, 2), value, jnp.float32), "bias": jnp.arange(2.0)}},
+        batch_stats={"norm": {"mean": jnp.full(2, -1.0 * value)}},
+        opt_state=({"mu": jnp.full(2, 0.5)},),
+    )
+    return jax.tree.map(lambda x: jax.device_put(x, sharding), state)
+
+
+def abstract(devices=1, width=3):
+    return jax.tree.map(lambda x: jax.ShapeDtypeStruct(x.shape, x.dtype, sharding=x.sharding), make_state(0, devices, width))
+
+
+def save(run, measures, devices=1):
+    """Save states of steps 10, 20, ... with these validation errors (None: not validated)."""
+    checkpoints = Checkpoints(run)
+    for i, error in enumerate(measures, start=1):
+        checkpoints.save(10 * i, make_state(10 * i, devices), POSITION, None if error is None else {MEASURE: error})
+    checkpoints.close()
+
+
+def assert_is(state, step):
+    assert int(state.step) == step
+    jax.tree.map(lambda a, b: np.testing.assert_array_equal(np.array(a), np.array(b)), state, make_state(step))
+
+
+def test_what_is_saved_comes_back_with_the_position_of_the_pipeline(tmp_path):
+    save(tmp_path, [3.0])
+    checkpoints = Checkpoints(tmp_path)
+    restored = checkpoints.restore_last(abstract())
+    checkpoints.close()
+    assert restored is not None
+    assert_is(restored[0], 10)
+    assert restored[1] == POSITION
+
+
+def test_an_empty_run_has_nothing_to_restore(tmp_path):
+    checkpoints = Checkpoints(tmp_path)
+    assert checkpoints.restore_last(abstract()) is None
+    checkpoints.close()
+
+
+def test_the_best_on_validation_and_the_last_are_kept(tmp_path):
+    save(tmp_path, [5.0, 2.0, 4.0, 3.0, None])
+    kept = sorted(int(path.name) for path in (tmp_path / "checkpoints").iterdir() if path.is_dir())
+    assert kept == [20, 50]
+    assert_is(load_state(tmp_path, abstract()), 20)
+    assert_is(load_state(tmp_path, abstract(), "last"), 50)
+
+
+def test_a_run_that_was_never_validated_has_its_last_state(tmp_path):
+    save(tmp_path, [None, None])
+    assert_is(load_state(tmp_path, abstract(), "best"), 20)
+
+
+def test_a_step_is_saved_once(tmp_path):
+    save(tmp_path, [3.0])
+    checkpoints = Checkpoints(tmp_path)
+    checkpoints.save(10, make_state(10), POSITION)
+    checkpoints.close()
+    assert_is(load_state(tmp_path, abstract()), 10)
+
+
+def test_a_state_of_eight_devices_restores_on_one(tmp_path):
+    save(tmp_path, [1.0], devices=8)
+    state = load_state(tmp_path, abstract(devices=1))
+    assert_is(state, 10)
+    assert {len(leaf.sharding.device_set) for leaf in jax.tree.leaves(state)} == {1}
+
+
+def test_no_checkpoints_folder_is_named(tmp_path):
+    with pytest.raises(ValueError, match=f"{tmp_path}/checkpoints: expected checkpoints, found no such folder"):
+        load_state(tmp_path, abstract())
+
+
+def test_a_folder_without_a_checkpoint_is_named(tmp_path):
+    save(tmp_path, [])
+    with pytest.raises(ValueError, match=f"{tmp_path}/checkpoints: expected a checkpoint, found none"):
+        load_state(tmp_path, abstract())
+
+
+def test_a_checkpoint_of_another_network_is_refused(tmp_path):
+    save(tmp_path, [1.0])
+    with pytest.raises(ValueError, match=r"checkpoints, step 10: expected a whole checkpoint of the network in config\.json"):
+        load_state(tmp_path, abstract(width=4))
+    other = abstract().replace(params={"another": abstract().params["layer"]})
+    with pytest.raises(ValueError, match="step 10: expected a whole checkpoint of the network"):
+        load_state(tmp_path, other)
+
+
+def damage_removed_arrays(step):
+    shutil.rmtree(next(path for path in step.rglob("d") if path.is_dir()))
+
+
+def damage_truncated(step):
+    for path in step.rglob("*"):
+        if path.is_file() and path.parent.name == "d":
+            path.write_bytes(path.read_bytes()[: path.stat().st_size // 2])
+
+
+def damage_emptied_metadata(step):
+    for path in step.rglob("_METADATA"):
+        path.write_text("")
+
+
+@pytest.mark.parametrize("damage", [damage_removed_arrays, damage_truncated, damage_emptied_metadata])
+def test_a_damaged_checkpoint_is_refused(tmp_path, damage):
+    save(tmp_path, [1.0])
+    damage(tmp_path / "checkpoints" / "10")
+    message = "checkpoints, step 10: expected a whole checkpoint of the network"
+    with pytest.raises(ValueError, match=message) as refused:
+        load_state(tmp_path, abstract())
+    assert len(str(refused.value)) < 600
+    assert "\n" not in str(refused.value)
+    checkpoints = Checkpoints(tmp_path)
+    with pytest.raises(ValueError, match=message):
+        checkpoints.restore_last(abstract())
+    checkpoints.close()
+
+
+def test_a_run_folder_keeps_its_config(tmp_path):
+    run, config = tmp_path / "runs" / "one", Config(name="one", seed=3)
+    write_config(run, config)
+    assert read_config(run) == config
+    write_config(run, config)
+    assert [path.name for path in run.iterdir()] == ["config.json"]
+
+
+def test_another_config_is_refused_by_the_flags_that_differ(tmp_path):
+    write_config(tmp_path, Config())
+    changed = dataclasses.replace(Config(), seed=5, data=dataclasses.replace(Config().data, noise_std=0.0))
+    with pytest.raises(ValueError, match=r"config\.json is of another config \(seed: 0 -> 5; data\.noise_std: 0\.01 -> 0\.0\)"):
+        write_config(tmp_path, changed)
+    assert read_config(tmp_path) == Config()
+    assert differences(Config(), Config()) == []
+
+
+@pytest.mark.parametrize("text", ["", "{", '{"name": "x"}', "[]"])
+def test_a_damaged_config_is_named(tmp_path, text):
+    (tmp_path / "config.json").write_text(text)
+    with pytest.raises(ValueError, match=f"{tmp_path}/config.json"):
+        read_config(tmp_path)

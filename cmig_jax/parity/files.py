@@ -7,6 +7,7 @@ tensors that the Flax network has no place for, and those that its float32 would
 from __future__ import annotations
 
 import pickle
+import warnings
 import zipfile
 from collections.abc import Mapping
 from pathlib import Path
@@ -47,7 +48,9 @@ def read_torch(path: Path) -> Arrays:
         if path.suffix == ".safetensors":
             content: Any = safetensors.torch.load_file(path)
         else:
-            content = torch.load(path, map_location="cpu", weights_only=True)
+            with warnings.catch_warnings():
+                warnings.simplefilter("ignore")  # about the pickle's protocol, on files that are refused anyway
+                content = torch.load(path, map_location="cpu", weights_only=True)
     except pickle.UnpicklingError as error:
         reason = str(error).strip().splitlines()[0]
         raise ValueError(f"{path}: refused, since it holds more than tensors or is no PyTorch file ({reason})") from error
@@ -115,7 +118,7 @@ def _unwrap(content: Any) -> dict[Any, Any]:
         if isinstance(content, Mapping) and isinstance(content.get(wrapper), Mapping):
             content = content[wrapper]
     if not isinstance(content, Mapping):
-        return {"the whole file": content}
+        return {"the whole file": None}
     state = dict(content)
     while state and all(str(name).startswith("module.") for name in state):
         state = {str(name).removeprefix("module."): value for name, value in state.items()}

@@ -7,6 +7,7 @@ outputs, and so gives its share of the gradient. Choices (graphs, keypoints, cor
 
 from __future__ import annotations
 
+import functools
 from collections.abc import Callable
 from dataclasses import replace
 from typing import Any
@@ -88,22 +89,26 @@ class _Parts:
         own = [{path: x for path, x in self._variables[kind].items() if _below(path, paths)} for kind in ("params", "batch_stats")]
         params, stats = (traverse_util.unflatten_dict({path[depth:]: x for path, x in flat.items()}) for flat in own)
 
-        def forward(params: Any, stats: Any, inputs: tuple[Any, ...]) -> Any:
-            return call({"params": params, "batch_stats": stats}, *inputs)
-
-        def both(params: Any, stats: Any, inputs: tuple[Any, ...], cotangent: Any) -> Any:
-            output, pull, rest = jax.vjp(lambda p: forward(p, stats, inputs), params, has_aux=True)
-            return output, rest, pull(cotangent)[0]
-
         if not self.train:
-            output, (_, others) = jax.jit(forward)(params, stats, inputs)
+            output, (_, others) = _forward(call, params, stats, inputs)
             return output, others
-        output, (new, others), gradients = jax.jit(both)(params, stats, inputs, cotangent)
+        output, (new, others), gradients = _forward_and_back(call, params, stats, inputs, cotangent)
         parent = tuple(paths[0].split("/")[:depth])
         for path, gradient in traverse_util.flatten_dict(gradients).items():
             self.gradients[parent + path] = self.gradients.get(parent + path, 0) + gradient  # tied weights add up
         self.statistics |= {parent + path: value for path, value in traverse_util.flatten_dict(new).items()}
         return output, others
+
+
+@functools.partial(jax.jit, static_argnums=0)
+def _forward(call: Callable[..., Any], params: Any, stats: Any, inputs: tuple[Any, ...]) -> Any:
+    return call({"params": params, "batch_stats": stats}, *inputs)
+
+
+@functools.partial(jax.jit, static_argnums=0)
+def _forward_and_back(call: Callable[..., Any], params: Any, stats: Any, inputs: tuple[Any, ...], cotangent: Any) -> Any:
+    output, pull, rest = jax.vjp(lambda p: call({"params": p, "batch_stats": stats}, *inputs), params, has_aux=True)
+    return output, rest, pull(cotangent)[0]
 
 
 def _below(path: tuple[str, ...], modules: tuple[str, ...]) -> bool:

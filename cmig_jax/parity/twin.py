@@ -132,8 +132,8 @@ class Twin(nn.Module):
     ) -> list[Tensor]:
         """Search correspondences, solve for the pose, move, repeat; return the losses taken on the way (none without labels)."""
         terms = []
-        R = torch.eye(3, dtype=src.dtype).expand(len(src), 3, 3)
-        t = torch.zeros(len(src), 3, dtype=src.dtype)
+        R = torch.eye(3, dtype=src.dtype, device=src.device).expand(len(src), 3, 3)
+        t = torch.zeros(len(src), 3, dtype=src.dtype, device=src.device)
         pairs = feature_pairs(f_src, f_tgt)
         for i in range(self.sizes.iterations):
             match_F = self.sim_mat_Fconv[i](pairs)

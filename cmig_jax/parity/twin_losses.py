@@ -16,8 +16,8 @@ def cross_modal(src: Tensor, tgt: Tensor, image: Tensor, temperature: float = 0.
     vectors = F.normalize(torch.cat((pooled, image)), dim=-1)
     B = len(image)
     similarity = vectors @ vectors.T / temperature
-    similarity = similarity.masked_fill(torch.eye(2 * B, dtype=torch.bool), -torch.inf)
-    partner = torch.cat((torch.arange(B, 2 * B), torch.arange(B)))
+    similarity = similarity.masked_fill(torch.eye(2 * B, dtype=torch.bool, device=image.device), -torch.inf)
+    partner = torch.arange(2 * B, device=image.device).roll(B)
     return F.cross_entropy(similarity, partner)
 
 
@@ -60,7 +60,7 @@ def matching(match: Tensor, label: Tensor) -> Tensor:
 
 def credibility(logit: Tensor, chosen: Tensor) -> Tensor:
     """Cross entropy of the logits `[B, K]`; the target is 1 where the chosen target keypoint `[B, K]` has the same index."""
-    target = (chosen == torch.arange(chosen.shape[1])).to(logit.dtype)
+    target = (chosen == torch.arange(chosen.shape[1], device=chosen.device)).to(logit.dtype)
     return F.binary_cross_entropy_with_logits(logit, target)
 
 

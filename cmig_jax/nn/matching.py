@@ -7,15 +7,16 @@ and one from coordinates and adds them; the idam head takes one from both togeth
 from __future__ import annotations
 
 import flax.linen as nn
-import jax
 import jax.numpy as jnp
 from flax import struct
 from jax import Array
 
+from cmig_jax.geometry.maximum import maximum
 from cmig_jax.geometry.neighbors import squared_distances
 from cmig_jax.geometry.rigid import rotation_from_quaternion
-from cmig_jax.nn.mlp import MLP, Dense, NormedMLP, torch_kernel
-from cmig_jax.nn.norm import BatchNorm, channels
+from cmig_jax.nn.mlp import MLP, Dense, NormedMLP, Weights, torch_kernel
+from cmig_jax.nn.norm import channels
+from cmig_jax.nn.pairs import PairSum, PairTerm, Tower, chunks_of, joined, sweep
 from cmig_jax.structs import RigidTransform
 
 CREDIBILITY_WIDTH = 32
@@ -41,8 +42,7 @@ class KeypointSet:
 class CMIGNetHead(nn.Module):
     """The paper's head: features and coordinates guide the search independently.
 
-    `rows` bounds memory: in evaluation so many source keypoints are compared at a time; in training BatchNorm needs all pairs, and
-    the activations are recomputed instead of stored.
+    `rows` source keypoints are compared at a time (0: as many as suit the machine).
     """
 
     feature_widths: tuple[int, ...] = (256, 128, 64, 32, 32, 32)
@@ -52,23 +52,19 @@ class CMIGNetHead(nn.Module):
 
     def setup(self) -> None:
         self.feature_pairs = PairLayer(self.feature_widths[0], dtype=self.dtype)
-        self.feature_tower = Tower(self.feature_widths, dtype=self.dtype)
+        self.feature_tower = Tower(self.feature_widths, rows=self.rows, dtype=self.dtype)
         self.coordinate_pairs = PairLayer(self.coordinate_widths[0], reverse=True, dtype=self.dtype)
-        self.coordinate_tower = Tower(self.coordinate_widths, dtype=self.dtype)
-        self.pre = Dense(CREDIBILITY_WIDTH)
+        self.coordinate_tower = Tower(self.coordinate_widths, rows=self.rows, dtype=self.dtype)
+        self.pre = Weights(2, CREDIBILITY_WIDTH)
         self.credibility = Credibility()
 
     def __call__(self, source: KeypointSet, target: KeypointSet, *, train: bool) -> Match:
         """Match source keypoints to target keypoints."""
-        feature, coordinate, pooled = _by_rows(self, source, target, self.rows, train)
-        return Match(feature=feature, coordinate=coordinate, logit=self.credibility(pooled, train=train))
-
-    def block(self, source: KeypointSet, target: KeypointSet, *, train: bool) -> tuple[Array, Array, Array]:
-        """Compare rows of source keypoints with all target keypoints: `[B, R, K]` twice, `[B, R, 32]`."""
         feature, _ = self.feature_tower(self.feature_pairs(source.features, target.features), train=train)
         coordinate, _ = self.coordinate_tower(self.coordinate_pairs(source.points, target.points, source.points), train=train)
-        pooled = jnp.max(self.pre(jnp.stack([feature, coordinate], axis=-1)), axis=-2)
-        return feature, coordinate, pooled
+        split = chunks_of(*feature.shape, self.rows)
+        pooled = joined(sweep(_best_of_targets, self.pre(), (split(feature), split(coordinate))))
+        return Match(feature=feature, coordinate=coordinate, logit=self.credibility(pooled, train=train))
 
 
 class IDAMHead(nn.Module):
@@ -81,20 +77,15 @@ class IDAMHead(nn.Module):
     def setup(self) -> None:
         self.feature_pairs = PairLayer(self.feature_widths[0], dtype=self.dtype)
         self.coordinate_pairs = PairLayer(self.feature_widths[0], reverse=True, dtype=self.dtype)
-        self.tower = Tower(self.feature_widths, dtype=self.dtype)
+        self.tower = Tower(self.feature_widths, rows=self.rows, pooled=True, dtype=self.dtype)
         self.credibility = Credibility()
 
     def __call__(self, source: KeypointSet, target: KeypointSet, *, train: bool) -> Match:
         """Match source keypoints to target keypoints."""
-        similarity, pooled = _by_rows(self, source, target, self.rows, train)
+        features = self.feature_pairs(source.features, target.features)
+        coordinates = self.coordinate_pairs(source.points, target.points, source.points)
+        similarity, pooled = self.tower(features + coordinates, train=train)
         return Match(feature=similarity, coordinate=None, logit=self.credibility(pooled, train=train))
-
-    def block(self, source: KeypointSet, target: KeypointSet, *, train: bool) -> tuple[Array, Array]:
-        """Compare rows of source keypoints with all target keypoints: `[B, R, K]`, `[B, R, C]`."""
-        pairs = self.feature_pairs(source.features, target.features)
-        pairs += self.coordinate_pairs(source.points, target.points, source.points)
-        similarity, hidden = self.tower(pairs, train=train)
-        return similarity, jnp.max(hidden, axis=-2).astype(similarity.dtype)
 
 
 class PCRNetHead(nn.Module):
@@ -126,34 +117,23 @@ class PairLayer(nn.Module):
     dtype: jnp.dtype | None = None
 
     @nn.compact
-    def __call__(self, a: Array, b: Array, extra: Array | None = None) -> Array:
-        """Map rows `a [B, R, C]`, columns `b [B, K, C]` and row numbers `extra [B, R, E]` to `[B, R, K, features]`."""
+    def __call__(self, a: Array, b: Array, extra: Array | None = None) -> PairSum:
+        """Map rows `a [B, N, C]`, columns `b [B, M, C]` and row numbers `extra [B, N, E]` to pairs of `features` channels."""
         C, E = a.shape[-1], 0 if extra is None else extra.shape[-1]
         kernel = self.param("kernel", torch_kernel, (1 + C + E, self.features))
-        dtype = self.dtype or kernel.dtype
+        dtype, wide = self.dtype or kernel.dtype, kernel.dtype
         length, direction, rest = jnp.split(kernel.astype(dtype), (1, 1 + C))
         centre = jnp.mean(b, axis=-2, keepdims=True)  # cancels in the difference, and would cost it digits
-        difference = ((b - centre).astype(dtype) @ direction)[:, None] - ((a - centre).astype(dtype) @ direction)[:, :, None]
-        distance = pair_distances(a, b)[..., None]
+        row, column = (((x - centre).astype(dtype) @ direction).astype(wide) for x in (a, b))
+        distance = pair_distances(a, b)
         # No length, no direction: 1e-8 would blow up what rounding leaves of the difference.
-        scale = jnp.where(distance > 0, 1 / (distance + 1e-8), 0).astype(dtype)
-        pairs = distance.astype(dtype) * channels(length, 4) + difference * (-scale if self.reverse else scale)
-        return pairs if extra is None else pairs + (extra.astype(dtype) @ rest)[:, :, None]
-
-
-class Tower(nn.Module):
-    """What follows the first layer: BatchNorm and ReLU, more such layers, and one number per pair."""
-
-    widths: tuple[int, ...]
-    dtype: jnp.dtype | None = None
-
-    @nn.compact
-    def __call__(self, pairs: Array, *, train: bool) -> tuple[Array, Array]:
-        """Map `pairs [B, R, K, widths[0]]` to similarities `[B, R, K]` and the last hidden layer `[B, R, K, widths[-1]]`."""
-        hidden = nn.relu(BatchNorm(self.widths[0], name="first_norm")(pairs, train=train))
-        hidden = NormedMLP(self.widths[1:], dtype=self.dtype, name="hidden")(hidden, train=train)
-        similarity = Dense(1, dtype=self.dtype, name="last")(hidden)[..., 0]
-        return similarity.astype(jnp.promote_types(pairs.dtype, jnp.float32)), hidden
+        scale = jnp.where(distance > 0, 1 / (distance + 1e-8), 0)
+        none = jnp.zeros_like(column)
+        terms = (
+            PairTerm(distance, jnp.zeros_like(row), none + length.astype(wide)[None]),
+            PairTerm(-scale if self.reverse else scale, -row, column),
+        )
+        return PairSum(jnp.zeros_like(row) if extra is None else (extra.astype(dtype) @ rest).astype(wide), none, terms)
 
 
 class Credibility(nn.Module):
@@ -164,6 +144,13 @@ class Credibility(nn.Module):
         """Map `pooled [B, K, C]` to logits `[B, K]`."""
         hidden = NormedMLP((CREDIBILITY_WIDTH,), name="hidden")(pooled, train=train)
         return Dense(1, name="last")(hidden)[..., 0]
+
+
+def _best_of_targets(parameters: tuple[Array, Array], similarities: tuple[Array, Array]) -> Array:
+    """Apply a linear layer to each pair's two similarities `[B, R, K]`, and take the maximum over targets: `[B, R, C]`."""
+    (kernel, bias), (feature, coordinate) = parameters, similarities
+    own, other = (row[None, None, None, :] for row in kernel)
+    return maximum(feature[..., None] * own + coordinate[..., None] * other + channels(bias, 4), 2)
 
 
 def pair_distances(a: Array, b: Array) -> Array:
@@ -180,24 +167,3 @@ def pair_distances(a: Array, b: Array) -> Array:
         norms = jnp.sum(a**2, axis=-1)[:, :, None] + jnp.sum(b**2, axis=-1)[:, None]
         zero = square <= 4 * jnp.finfo(square.dtype).eps * norms
     return jnp.where(zero, 0, jnp.sqrt(jnp.where(zero, 1, square)))
-
-
-def _by_rows(head: CMIGNetHead | IDAMHead, source: KeypointSet, target: KeypointSet, rows: int, train: bool) -> tuple[Array, ...]:
-    """Run `head.block`, whole, recomputed (training) or in chunks of `rows` source keypoints (evaluation)."""
-    count = source.points.shape[1]
-    if rows == 0 or head.is_initializing():
-        return head.block(source, target, train=train)
-    if train:
-        return nn.remat(lambda head, s, t: head.block(s, t, train=True))(head, source, target)
-
-    def chunked(x: Array) -> Array:
-        padded = jnp.pad(x, [(0, 0), (0, -count % rows), (0, 0)])
-        return padded.reshape(x.shape[0], -1, rows, x.shape[-1]).swapaxes(0, 1)
-
-    scan = nn.scan(
-        lambda head, carry, s: (carry, head.block(s, target, train=False)),
-        variable_broadcast=("params", "batch_stats"),
-        split_rngs={"params": False},
-    )
-    results = scan(head, (), jax.tree.map(chunked, source))[1]
-    return tuple(r.swapaxes(0, 1).reshape(r.shape[1], -1, r.shape[-1])[:, :count] for r in results)

@@ -35,6 +35,20 @@ class Dense(nn.Module):
         return y + channels(bias.astype(dtype), y.ndim)
 
 
+class Weights(nn.Module):
+    """The parameters of a `Dense` layer, for callers that apply it themselves."""
+
+    inputs: int
+    features: int
+    use_bias: bool = True
+
+    @nn.compact
+    def __call__(self) -> tuple[Array, Array | None]:
+        """Return the kernel `[inputs, features]` and the bias `[features]`."""
+        kernel = self.param("kernel", torch_kernel, (self.inputs, self.features))
+        return kernel, self.param("bias", _torch_bias(self.inputs), (self.features,)) if self.use_bias else None
+
+
 def _torch_bias(fan_in: int) -> Callable[[Array, tuple[int, ...]], Array]:
     bound = fan_in**-0.5
     return lambda key, shape: jax.random.uniform(key, shape, minval=-bound, maxval=bound)

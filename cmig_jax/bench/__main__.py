@@ -1,0 +1,84 @@
+"""`python -m cmig_jax.bench`: ours beside the PyTorch twin, same weights and inputs, in turns; a table and, if wanted, JSON."""
+
+from __future__ import annotations
+
+import json as serialiser
+import sys
+from pathlib import Path
+from typing import Any, Literal
+
+import jax
+import tyro
+
+from cmig_jax.bench.cases import CASES
+from cmig_jax.bench.clouds import measure_clouds
+from cmig_jax.bench.run import run, use_compilation_cache
+
+
+def main(
+    cases: tuple[Literal["paper", "points", "quickstart", "tiny"], ...] = ("paper", "points", "quickstart"),
+    device: Literal["cpu", "gpu"] = "cpu",
+    repetitions: int = 5,
+    rows: int = 0,
+    stages: bool = True,
+    memory: bool = True,
+    clouds: tuple[int, ...] = (),
+    json: Path | None = None,
+) -> None:
+    """Compare time and memory with the PyTorch twin.
+
+    Args:
+        cases: `paper`: batch of 2 pairs, 768 points, 20 views of 224 x 224, K = 256, n = 3, float32; `points`: that without the image
+            encoder, whose result both are given; `quickstart`: the small preset's network and batch; `tiny`: for tests.
+        device: where to compute.
+        repetitions: of every measurement; medians are reported.
+        rows: `compute.rows` of our network.
+        stages: also time every stage alone.
+        memory: also take peak memory, in separate processes.
+        clouds: instead, register clouds of these sizes with our network (`--rows` is 512 if not given) and print time and memory.
+        json: file to write the results to.
+    """
+    if repetitions < 1:
+        sys.exit(f"error: --repetitions {repetitions}: expected at least 1")
+    if clouds:
+        results: dict[str, Any] = {"clouds": measure_clouds(clouds, rows or 512, device)}
+        print("\n".join(cloud_lines(results["clouds"])))
+    else:
+        cache = use_compilation_cache()
+        results = run(cases, repetitions, device, rows, memory, stages)
+        print("\n".join(line for name in cases for line in case_lines(name, results[name])))
+        print(f"persistent compilation cache: {cache}")
+    if json is not None:
+        header = {"device": device, "repetitions": repetitions, "rows": rows, "jax": jax.__version__}
+        json.write_text(serialiser.dumps(header | results, indent=1) + "\n")
+
+
+def case_lines(name: str, result: dict[str, Any]) -> list[str]:
+    """Write a case as a table."""
+    case = CASES[name]
+    images = f"{case.views} views of {case.image_size} x {case.image_size}" if case.images else "image features given"
+    lines = [f"{name}: {case.pairs} pairs of {case.points} points, {images}, K = {case.sizes.keypoints}, n = {case.sizes.iterations}"]
+    lines.append(f"  {'':26} {'PyTorch s':>10} {'ours s':>10} {'ratio':>7} {'Gop':>8} {'GB moved':>9}")
+    for mode in ("inference", "training"):
+        for what, row in result[mode].items():
+            numbers = f"{row['pytorch_s']:10.4f} {row['ours_s']:10.4f} {row['ratio']:7.2f}"
+            lines.append(f"  {mode + ' ' + what:26} {numbers} {row['operations'] / 1e9:8.1f} {row['bytes'] / 1e9:9.2f}")
+    for what, key in (("training", "memory"), ("inference", "memory_inference")):
+        if key in result:
+            row = result[key]
+            lines.append(f"  peak memory, {what:13} {row['pytorch_gb']:7.2f} GB {row['ours_gb']:7.2f} GB {row['ratio']:7.2f}")
+    compiled = ", ".join(f"{mode} {seconds:.1f} s" for mode, seconds in result["compile_s"].items())
+    return [*lines, f"  compilation (ours, or its reading from the cache): {compiled}"]
+
+
+def cloud_lines(rows: list[dict[str, float]]) -> list[str]:
+    """Write the table of cloud sizes."""
+    head = f"{'points':>7} {'seconds':>8} {'peak GB':>8} {'above the runtime GB':>21} {'compile s':>10}"
+    body = [
+        f"{r['points']:7.0f} {r['seconds']:8.2f} {r['peak_gb']:8.2f} {r['above_runtime_gb']:21.2f} {r['compile_s']:10.1f}" for r in rows
+    ]
+    return [head, *body]
+
+
+if __name__ == "__main__":
+    tyro.cli(main)

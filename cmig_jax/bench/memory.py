@@ -1,0 +1,64 @@
+"""Peak memory of one network doing one thing, in a process of its own: `measure` starts it, `python -m cmig_jax.bench.memory` is it."""
+
+from __future__ import annotations
+
+import json
+import subprocess
+import sys
+from pathlib import Path
+from typing import Any, Literal
+
+Who = Literal["ours", "pytorch"]
+
+
+def measure(case: str, who: Who, what: str, device: str, rows: int) -> dict[str, float]:
+    """Run one network in a new process.
+
+    Args:
+        case: name of the case.
+        who: which network.
+        what: `inference` or `training`.
+        device: `cpu` or `gpu`.
+        rows: `compute.rows` of ours.
+
+    Returns:
+        `peak_gb`, the largest resident memory of the process (of the device, on a GPU), and `above_runtime_gb`, without what the process
+        held once libraries, weights and inputs were loaded.
+    """
+    return in_a_process("cmig_jax.bench.memory", case, who, what, device, str(rows))
+
+
+def in_a_process(module: str, *arguments: str) -> dict[str, Any]:
+    """Run a module and read the JSON on the last line that it prints."""
+    done = subprocess.run([sys.executable, "-m", module, *arguments], capture_output=True, text=True, check=False)
+    if done.returncode:
+        raise RuntimeError(f"{module} {' '.join(arguments)} ended with code {done.returncode}:\n{done.stderr[-2000:]}")
+    return json.loads(done.stdout.strip().splitlines()[-1])
+
+
+def resident(field: Literal["VmHWM", "VmRSS"]) -> int:
+    """Return the largest (VmHWM) or present (VmRSS) resident memory of this process, bytes; 0 where the system does not say."""
+    status = Path("/proc/self/status")
+    lines = status.read_text().splitlines() if status.exists() else []
+    return next((int(line.split()[1]) * 1024 for line in lines if line.startswith(field)), 0)
+
+
+def main(case_name: str, who: Who, what: str, device: str, rows: int) -> dict[str, float]:
+    """Do it twice in this process; return the peaks."""
+    from cmig_jax.bench.run import make_ours, make_twin  # torch or jax are loaded here, by the process that is measured
+
+    if who == "ours":
+        network: Any = make_ours(case_name, device, rows)
+    else:
+        network = make_twin(case_name, device)
+    before = resident("VmRSS")
+    work = getattr(network, what)()
+    work()
+    work()
+    peak = network.peak_bytes() if device == "gpu" else resident("VmHWM")
+    return {"peak_gb": peak / 1e9, "above_runtime_gb": (peak - (0 if device == "gpu" else before)) / 1e9}
+
+
+if __name__ == "__main__":
+    case_name, who, what, device, rows = sys.argv[1:]
+    print(json.dumps(main(case_name, who, what, device, int(rows))))  # type: ignore[arg-type]

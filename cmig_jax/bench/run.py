@@ -1,0 +1,95 @@
+"""Measure the cases one after another."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+import jax
+from tqdm import tqdm
+
+from cmig_jax.bench.cases import CASES, make_arrays
+from cmig_jax.bench.clock import in_turns
+from cmig_jax.bench.memory import measure
+from cmig_jax.bench.ours import Ours
+from cmig_jax.config import ComputeConfig
+from cmig_jax.parity.recorded import named_weights
+from cmig_jax.parity.twin_bench import TwinBench
+from cmig_jax.parity.twin_run import state_shapes
+
+
+def run(names: Sequence[str], repetitions: int, device: str, rows: int, memory: bool, stages: bool) -> dict[str, Any]:
+    """Measure cases.
+
+    Args:
+        names: of the cases.
+        repetitions: of each measurement; medians are reported.
+        device: `cpu` or `gpu`.
+        rows: `compute.rows` of ours.
+        memory: also take peak memory, each network in processes of its own.
+        stages: also time each stage alone.
+
+    Returns:
+        for every case `inference` and `training`, each with `whole` and the stages (`ratio`, `pytorch_s`, `ours_s`), `memory` of a
+        training step, `memory_inference`, and `compile_s`; `ratio` is PyTorch over ours.
+    """
+    results: dict[str, Any] = {}
+    for name in names:
+        results[name] = _times(name, repetitions, device, rows, stages)
+        if memory:
+            results[name] |= {
+                "memory": _memory(name, "training", device, rows),
+                "memory_inference": _memory(name, "inference", device, rows),
+            }
+    return results
+
+
+def use_compilation_cache() -> str:
+    """Keep compiled programs on disk; return the folder (JAX_COMPILATION_CACHE_DIR, if that is set)."""
+    folder = os.environ.get("JAX_COMPILATION_CACHE_DIR") or str(Path.home() / ".cache" / "cmig_jax" / "compiled")
+    jax.config.update("jax_compilation_cache_dir", folder)
+    return folder
+
+
+def make_ours(name: str, device: str, rows: int = 0) -> Ours:
+    """Build our network on a case's inputs."""
+    use_compilation_cache()
+    jax.config.update("jax_platforms", "cuda" if device == "gpu" else "cpu")
+    return Ours(CASES[name], make_arrays(CASES[name]), ComputeConfig(rows=rows))
+
+
+def make_twin(name: str, device: str) -> TwinBench:
+    """Build the twin on a case's inputs, with the same weights."""
+    case, arrays = CASES[name], make_arrays(CASES[name])
+    images = arrays.views if case.images else arrays.image_features
+    state = named_weights(state_shapes(case.sizes), seed=0)
+    return TwinBench(
+        case.sizes, state, arrays.source, arrays.target, images, arrays.R, arrays.t, device="cuda" if device == "gpu" else "cpu"
+    )
+
+
+def _times(name: str, repetitions: int, device: str, rows: int, stages: bool) -> dict[str, Any]:
+    ours, twin = make_ours(name, device, rows), make_twin(name, device)
+    results: dict[str, Any] = {"inference": {}, "training": {}}
+    for mode, train in (("inference", False), ("training", True)):
+        pairs = {"whole": (twin.training() if train else twin.inference(), ours.training() if train else ours.inference())}
+        if stages:
+            theirs, own = twin.stages(train), ours.stages(train)
+            pairs |= {stage: (theirs[stage], own[stage]) for stage in own}
+        for what, works in tqdm(pairs.items(), desc=f"{name} {mode}", leave=False, disable=None):
+            results[mode][what] = in_turns(*works, repetitions).as_json() | ours.costs[mode if what == "whole" else f"{mode}.{what}"]
+    results["compile_s"] = {mode: ours.compile_seconds[mode] for mode in ("inference", "training")}
+    return results
+
+
+def _memory(name: str, what: str, device: str, rows: int) -> dict[str, float]:
+    theirs, ours = (measure(name, who, what, device, rows) for who in ("pytorch", "ours"))
+    return {
+        "ratio": theirs["peak_gb"] / ours["peak_gb"],
+        "pytorch_gb": theirs["peak_gb"],
+        "ours_gb": ours["peak_gb"],
+        "pytorch_above_runtime_gb": theirs["above_runtime_gb"],
+        "ours_above_runtime_gb": ours["above_runtime_gb"],
+    }

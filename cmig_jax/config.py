@@ -10,7 +10,7 @@ import dataclasses
 import json
 from collections.abc import Mapping
 from dataclasses import dataclass, field
-from typing import Any, Literal, get_args, get_type_hints
+from typing import Any, Literal, get_args, get_origin, get_type_hints
 
 Categories = Literal["all", "first-half", "second-half"]
 
@@ -245,6 +245,10 @@ def _rules(c: Config) -> list[tuple[str, bool, str]]:
         (f"data.keep = {d.keep}", 0 < d.keep <= 1, "a share in (0, 1]"),
         (f"data.noise_std = {d.noise_std}", d.noise_std >= 0, "0 or more"),
         (f"data.noise_clip = {d.noise_clip}", d.noise_clip >= 0, "0 or more"),
+        (f"data.max_translation = {d.max_translation}", d.max_translation >= 0, "0 or more"),
+        (f"data.test_seed = {d.test_seed}", d.test_seed >= 0, "0 or more"),
+        (f"data.workers = {d.workers}", d.workers >= 0, "0 or more"),
+        (f"seed = {c.seed}", c.seed >= 0, "0 or more"),
         (f"data.max_angle_deg = {d.max_angle_deg}", 0 <= d.max_angle_deg <= 180, "degrees in [0, 180]"),
         (f"data.validation = {d.validation}", 0 < d.validation < 1, "a share in (0, 1)"),
         (f"data.shapes = {d.shapes}", d.shapes >= 4, "at least 4 per category"),
@@ -256,9 +260,11 @@ def _rules(c: Config) -> list[tuple[str, bool, str]]:
             m.keypoints.select == "all" or 2 <= m.keypoints.count <= kept,
             f"2 to {kept}, the points that are left after the crop",
         ),
+        (f"model.points.widths = {m.points.widths}", _positive(m.points.widths), "one or more numbers above 0"),
+        (f"model.points.dim = {m.points.dim}", m.points.dim >= 4, "at least 4"),
         (
             f"model.image.widths = {m.image.widths}",
-            not uses_views or m.image.widths[-1] == m.points.dim,
+            _positive(m.image.widths) and (not uses_views or m.image.widths[-1] == m.points.dim),
             f"the last one to equal model.points.dim = {m.points.dim}",
         ),
         (
@@ -276,7 +282,21 @@ def _rules(c: Config) -> list[tuple[str, bool, str]]:
             not (m.fusion.image == "transformer" and m.fusion.points == "none"),
             "model.fusion.points = transformer, whose weights it shares",
         ),
+        (f"model.fusion.feed_forward = {m.fusion.feed_forward}", m.fusion.feed_forward >= 1, "at least 1"),
+        (
+            f"model.matching.feature_widths = {m.matching.feature_widths}",
+            _positive(m.matching.feature_widths),
+            "one or more numbers above 0",
+        ),
+        (
+            f"model.matching.coordinate_widths = {m.matching.coordinate_widths}",
+            _positive(m.matching.coordinate_widths),
+            "one or more numbers above 0",
+        ),
         (f"model.matching.iterations = {m.matching.iterations}", m.matching.iterations >= 1, "at least 1"),
+        (f"loss.overlap_threshold = {c.loss.overlap_threshold}", c.loss.overlap_threshold > 0, "above 0"),
+        (f"loss.match_threshold = {c.loss.match_threshold}", c.loss.match_threshold > 0, "above 0"),
+        (f"loss.margins = {c.loss.margins}", min(c.loss.margins) >= 0, "two distances, 0 or more"),
         (f"loss.temperature = {c.loss.temperature}", c.loss.temperature > 0, "above 0"),
         (
             f"optim.batch = {o.batch} with loss.cross_modal = {c.loss.cross_modal}",
@@ -286,8 +306,15 @@ def _rules(c: Config) -> list[tuple[str, bool, str]]:
         (f"optim.epochs = {o.epochs}", o.epochs >= 1, "at least 1"),
         (f"optim.validate_every = {o.validate_every}", o.validate_every >= 1, "at least 1"),
         (f"optim.learning_rate = {o.learning_rate}", o.learning_rate > 0, "above 0"),
+        (f"optim.weight_decay = {o.weight_decay}", o.weight_decay >= 0, "0 or more"),
+        (f"optim.decay = {o.decay}", 0 < o.decay <= 1, "a factor in (0, 1]"),
+        (f"optim.clip_norm = {o.clip_norm}", o.clip_norm >= 0, "0 (off) or a norm"),
         (f"compute.rows = {c.compute.rows}", c.compute.rows >= 0, "0 (whole) or a chunk size"),
     ]
+
+
+def _positive(widths: tuple[int, ...]) -> bool:
+    return len(widths) > 0 and min(widths) > 0
 
 
 def to_json(config: Config) -> str:
@@ -325,4 +352,15 @@ def _value(hint: Any, value: Any, where: str) -> Any:
         if value not in get_args(hint):
             raise ValueError(f"{where} = {value!r}: expected one of {', '.join(get_args(hint))}")
         return value
-    return tuple(value) if isinstance(value, list) else value
+    if get_origin(hint) is tuple:
+        kinds = get_args(hint)
+        if not isinstance(value, list) or (kinds[-1] is not ... and len(value) != len(kinds)):
+            raise ValueError(f"{where} = {value!r}: expected a list of {'' if kinds[-1] is ... else len(kinds)} numbers")
+        return tuple(_value(kinds[0], item, f"{where}[{i}]") for i, item in enumerate(value))
+    allowed = get_args(hint) or (hint,)
+    if float in allowed and type(value) is int:
+        return float(value)
+    if type(value) not in allowed:
+        expected = " or ".join("null" if kind is type(None) else kind.__name__ for kind in allowed)
+        raise ValueError(f"{where} = {value!r}: expected {expected}")
+    return value

@@ -9,6 +9,21 @@ import pytest
 from cmig_jax.config import Config, FusionConfig, ModelConfig, ViewsConfig, _rules, from_json, to_json
 
 REFUSED = {
+    "seed": [-1],
+    "data.max_translation": [-0.5],
+    "data.test_seed": [-1],
+    "data.workers": [-1],
+    "model.points.widths": [(), (64, 0)],
+    "model.points.dim": [2],
+    "model.fusion.feed_forward": [0],
+    "model.matching.feature_widths": [()],
+    "model.matching.coordinate_widths": [(0,)],
+    "loss.overlap_threshold": [0.0],
+    "loss.match_threshold": [-0.05],
+    "loss.margins": [(-1.0, 3.0)],
+    "optim.weight_decay": [-1e-3],
+    "optim.decay": [0.0, 2.0],
+    "optim.clip_norm": [-1.0],
     "data.points": [0],
     "data.keep": [0.0, 1.5, -0.1],
     "data.noise_std": [-0.01],
@@ -113,3 +128,17 @@ def test_what_is_no_config_is_refused():
 def test_reading_applies_the_rules():
     with pytest.raises(ValueError, match=r"data\.keep = 2"):
         from_json(edited("data.keep", lambda inner, name: inner.__setitem__(name, 2)))
+
+
+@pytest.mark.parametrize(
+    ("flag", "value"), [("optim.batch", "six"), ("optim.batch", True), ("data.root", 5), ("loss.margins", [1.0]), ("name", None)]
+)
+def test_a_value_of_the_wrong_type_is_named(flag: str, value: object) -> None:
+    values = json.loads(to_json(Config()))
+    *groups, last = flag.split(".")
+    group = values
+    for name in groups:
+        group = group[name]
+    group[last] = value
+    with pytest.raises(ValueError, match=flag):
+        from_json(json.dumps(values))

@@ -126,8 +126,8 @@ class CMIGNet(nn.Module):
         if self.image_fusion == "none" or tokens is None:
             return source, target
         if self.image_fusion != "views":
-            tokens = maximum(tokens, 2)[:, :, None]  # F_I; N equal tokens act as one
-        of_source, of_target = (tokens[:, s].astype(source.dtype) for s in (0, -1))
+            tokens = jnp.expand_dims(maximum(tokens, 2), 2)  # F_I; N equal tokens act as one
+        of_source, of_target = tokens[:, 0].astype(source.dtype), tokens[:, -1].astype(source.dtype)
         layer = self.transformer if self.image_fusion == "transformer" else self.cross_attention
         assert layer is not None
         return source + layer(source, of_source), target + layer(target, of_target)

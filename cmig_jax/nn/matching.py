@@ -128,12 +128,11 @@ class PairLayer(nn.Module):
         distance = pair_distances(a, b)
         # No length, no direction: 1e-8 would blow up what rounding leaves of the difference.
         scale = jnp.where(distance > 0, 1 / (distance + 1e-8), 0)
-        none = jnp.zeros_like(column)
         terms = (
-            PairTerm(distance, jnp.zeros_like(row), none + length.astype(wide)[None]),
+            PairTerm(distance, None, length.astype(wide)[None]),
             PairTerm(-scale if self.reverse else scale, -row, column),
         )
-        return PairSum(jnp.zeros_like(row) if extra is None else (extra.astype(dtype) @ rest).astype(wide), none, terms)
+        return PairSum(jnp.zeros_like(row) if extra is None else (extra.astype(dtype) @ rest).astype(wide), terms)
 
 
 class Credibility(nn.Module):

@@ -30,40 +30,45 @@ PAIRS_ON_ACCELERATORS = 2**20
 
 @struct.dataclass
 class PairTerm:
-    """Values over pairs, `scale_ij * (row_i + column_j)`: `[B, N, M]`, `[B, N, C]`, `[B, M, C]`."""
+    """Values over pairs, `scale_ij * (row_i + column_j)`: `[B, N, M]`, `[B, N, C]` or None for 0, `[B, M, C]` or `[1, 1, C]`."""
 
     scale: Array
-    row: Array
+    row: Array | None
     column: Array
+
+    def times(self, factor: Array) -> PairTerm:
+        """Multiply the channels by `factor [C]`."""
+        factor = factor[None, None, :]
+        return PairTerm(self.scale, None if self.row is None else self.row * factor, self.column * factor)
 
 
 @struct.dataclass
 class PairSum:
-    """Values over pairs: `row_i + column_j` and terms."""
+    """Values over pairs: `row_i` `[B, N, C]` and terms."""
 
     row: Array
-    column: Array
     terms: tuple[PairTerm, ...]
 
     def __add__(self, other: PairSum) -> PairSum:
-        return PairSum(self.row + other.row, self.column + other.column, self.terms + other.terms)
+        return PairSum(self.row + other.row, self.terms + other.terms)
 
     def values(self) -> Array:
         """Return `[B, N, M, C]`."""
-
-        def outer(row: Array, column: Array) -> Array:
-            return row[:, :, None] + column[:, None]
-
-        return sum((t.scale[..., None] * outer(t.row, t.column) for t in self.terms), outer(self.row, self.column))
+        total = self.row[:, :, None]
+        for t in self.terms:
+            column = t.column[:, None]
+            total = total + t.scale[..., None] * (column if t.row is None else column + t.row[:, :, None])
+        return total
 
     def moments(self) -> Moments:
         """Take mean and variance per channel from sums over points; everything is centred first, so that squares keep their digits."""
-        (B, N, _), M = self.row.shape, self.column.shape[1]
-        row, column, terms = self.row, self.column, []
+        B, N, M = self.terms[0].scale.shape
+        row, column, terms = self.row, jnp.zeros((B, M, self.row.shape[-1]), self.row.dtype), []
         for t in self.terms:
+            a, b = jnp.zeros_like(row) if t.row is None else t.row, jnp.broadcast_to(t.column, column.shape)
             middle = jnp.mean(t.scale)
-            row, column = row + middle * t.row, column + middle * t.column
-            terms.append((t.scale - middle, t.row, t.column))
+            row, column = row + middle * a, column + middle * b
+            terms.append((t.scale - middle, a, b))
         means = [jnp.mean(x, axis=(0, 1), keepdims=True) for x in (row, column)]
         terms.append((jnp.ones((B, N, M), row.dtype), row - means[0], column - means[1]))
         first, second = jnp.zeros_like(row[0, 0]), jnp.zeros_like(row[0, 0])
@@ -78,12 +83,7 @@ class PairSum:
 
     def normalised(self, affine: Affine) -> PairSum:
         """Apply what BatchNorm does to a channel."""
-        scale = affine.scale[None, None, :]
-        return PairSum(
-            row=(self.row - affine.mean[None, None, :]) * scale + affine.bias[None, None, :],
-            column=self.column * scale,
-            terms=tuple(PairTerm(t.scale, t.row * scale, t.column * scale) for t in self.terms),
-        )
+        return PairSum(affine(self.row), tuple(t.times(affine.scale) for t in self.terms))
 
 
 def _weighted(weight: Array, row: Array, column: Array) -> Array:
@@ -159,15 +159,14 @@ def _hidden(shared: Any, chunk: Any, dtype: jnp.dtype) -> Array:
 
 def _chunked(pairs: PairSum, rows: int) -> tuple[Any, Any]:
     """Split a sum into what belongs to columns and chunks of what belongs to rows."""
-    (B, N, _), M = pairs.row.shape, pairs.column.shape[1]
-    split = chunks_of(B, N, M, rows)
-    columns = (pairs.column, tuple(t.column for t in pairs.terms))
-    return columns, (split(pairs.row), tuple((split(t.scale), split(t.row)) for t in pairs.terms))
+    split = chunks_of(*pairs.terms[0].scale.shape, rows)
+    columns = tuple(t.column for t in pairs.terms)
+    return columns, (split(pairs.row), tuple((split(t.scale), None if t.row is None else split(t.row)) for t in pairs.terms))
 
 
 def _values(chunk: Any, columns: Any) -> Array:
-    (row, terms), (column, others) = chunk, columns
-    return PairSum(row, column, tuple(PairTerm(s, a, b) for (s, a), b in zip(terms, others, strict=True))).values()
+    row, terms = chunk
+    return PairSum(row, tuple(PairTerm(s, a, b) for (s, a), b in zip(terms, columns, strict=True))).values()
 
 
 def chunks_of(B: int, N: int, M: int, rows: int) -> Callable[[Array], Array]:

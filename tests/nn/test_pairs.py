@@ -27,8 +27,9 @@ def normal(*shape, seed=0):
 
 def pair_sum(offset=0.0, dtype=np.float64):
     """Draw sums over 8 x 7 pairs whose terms have large means."""
-    terms = [PairTerm(normal(2, 8, 7, seed=s) + offset, normal(2, 8, 6, seed=s + 1), normal(2, 7, 6, seed=s + 2)) for s in (1, 4)]
-    whole = PairSum(normal(2, 8, 6, seed=7) + offset, normal(2, 7, 6, seed=8), tuple(terms))
+    length = PairTerm(normal(2, 8, 7, seed=1) + offset, None, normal(1, 1, 6, seed=2))
+    direction = PairTerm(normal(2, 8, 7, seed=4) + offset, normal(2, 8, 6, seed=5), normal(2, 7, 6, seed=6))
+    whole = PairSum(normal(2, 8, 6, seed=7) + offset, (length, direction))
     return jax.tree.map(lambda x: x.astype(dtype), whole)
 
 
@@ -77,8 +78,7 @@ def test_statistics_of_a_sum_are_those_of_its_values():
 
 def test_statistics_keep_their_digits_in_float32_where_a_term_has_a_large_mean():
     pairs = pair_sum()
-    large = PairTerm(1000 + pairs.terms[0].scale, 0 * pairs.terms[0].row, 1 + 0 * pairs.terms[0].column)
-    pairs = PairSum(pairs.row, pairs.column, (large,))
+    pairs = PairSum(pairs.row, (PairTerm(1000 + pairs.terms[0].scale, None, pairs.terms[0].column),))
     single = jax.tree.map(lambda x: x.astype(np.float32), pairs)
     np.testing.assert_allclose(single.moments().variance, pairs.moments().variance, rtol=1e-3)
 

@@ -62,7 +62,8 @@ class CMIGNetHead(nn.Module):
         """Match source keypoints to target keypoints."""
         feature, _ = self.feature_tower(self.feature_pairs(source.features, target.features), train=train)
         coordinate, _ = self.coordinate_tower(self.coordinate_pairs(source.points, target.points, source.points), train=train)
-        split = chunks_of(*feature.shape, self.rows)
+        B, N, M = feature.shape
+        split = chunks_of(B, N, M, self.rows)
         pooled = joined(sweep(_best_of_targets, self.pre(), (split(feature), split(coordinate))))
         return Match(feature=feature, coordinate=coordinate, logit=self.credibility(pooled, train=train))
 
@@ -85,6 +86,7 @@ class IDAMHead(nn.Module):
         features = self.feature_pairs(source.features, target.features)
         coordinates = self.coordinate_pairs(source.points, target.points, source.points)
         similarity, pooled = self.tower(features + coordinates, train=train)
+        assert pooled is not None
         return Match(feature=similarity, coordinate=None, logit=self.credibility(pooled, train=train))
 
 

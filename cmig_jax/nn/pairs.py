@@ -159,7 +159,8 @@ def _hidden(shared: Any, chunk: Any, dtype: jnp.dtype) -> Array:
 
 def _chunked(pairs: PairSum, rows: int) -> tuple[Any, Any]:
     """Split a sum into what belongs to columns and chunks of what belongs to rows."""
-    split = chunks_of(*pairs.terms[0].scale.shape, rows)
+    B, N, M = pairs.terms[0].scale.shape
+    split = chunks_of(B, N, M, rows)
     columns = tuple(t.column for t in pairs.terms)
     return columns, (split(pairs.row), tuple((split(t.scale), None if t.row is None else split(t.row)) for t in pairs.terms))
 
@@ -190,7 +191,6 @@ def _together(parts: Moments) -> Moments:
     return Moments(mean=mean, variance=variance, count=parts.count * parts.mean.shape[0])
 
 
-@functools.partial(jax.custom_vjp, nondiff_argnums=(0,))
 def sweep(function: Callable[[Any, Any], Any], shared: Any, chunks: Any) -> Any:
     """Apply `function(shared, chunk)` to one chunk after another; the derivative keeps the inputs and computes all else again.
 
@@ -199,11 +199,16 @@ def sweep(function: Callable[[Any, Any], Any], shared: Any, chunks: Any) -> Any:
         shared: arrays that every chunk reads.
         chunks: arrays with a leading axis over chunks.
     """
+    return _sweep(function, shared, chunks)
+
+
+@functools.partial(jax.custom_vjp, nondiff_argnums=(0,))
+def _sweep(function: Callable[[Any, Any], Any], shared: Any, chunks: Any) -> Any:
     return jax.lax.map(lambda chunk: function(shared, chunk), chunks)
 
 
 def _sweep_forward(function: Callable[[Any, Any], Any], shared: Any, chunks: Any) -> tuple[Any, tuple[Any, Any]]:
-    return sweep(function, shared, chunks), (shared, chunks)
+    return _sweep(function, shared, chunks), (shared, chunks)
 
 
 def _sweep_backward(function: Callable[[Any, Any], Any], saved: tuple[Any, Any], gradient: Any) -> tuple[Any, Any]:
@@ -217,4 +222,4 @@ def _sweep_backward(function: Callable[[Any, Any], Any], saved: tuple[Any, Any],
     return jax.lax.scan(visit, jax.tree.map(jnp.zeros_like, shared), (chunks, gradient))
 
 
-sweep.defvjp(_sweep_forward, _sweep_backward)
+_sweep.defvjp(_sweep_forward, _sweep_backward)

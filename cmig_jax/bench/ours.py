@@ -73,7 +73,7 @@ class Ours:
             assert isinstance(prediction, Prediction)
             return prediction.target_from_source
 
-        return self._compiled("inference", jax.jit(poses), (self.variables, self.batch.replace(target_from_source=None)))
+        return self._compiled("inference", jax.jit(poses), (self.variables, replace(self.batch, target_from_source=None)))
 
     def training(self) -> Work:
         """Compile the training step; each call takes one."""

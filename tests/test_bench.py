@@ -1,0 +1,69 @@
+"""The benchmark, tiny: its keys, finite ratios, and that both networks do the same work."""
+
+import json
+import math
+import os
+import subprocess
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from cmig_jax.bench.cases import CASES, make_arrays
+from cmig_jax.bench.clock import Timing, in_turns
+from cmig_jax.bench.clouds import measure_clouds
+from cmig_jax.bench.memory import resident
+
+pytest.importorskip("torch")
+
+
+def test_the_command_line_writes_the_keys_with_finite_ratios(tmp_path):
+    file, root = tmp_path / "bench.json", Path(__file__).parents[1]
+    command = [sys.executable, "-m", "cmig_jax.bench", "--cases", "tiny", "--repetitions", "1", "--no-stages", "--no-memory"]
+    environment = {**os.environ, "PYTHONPATH": str(root)}
+    done = subprocess.run([*command, "--json", str(file)], env=environment, capture_output=True, text=True, check=False)
+    assert done.returncode == 0, done.stderr
+    assert "compilation" in done.stdout
+    result = json.loads(file.read_text())["tiny"]
+    for mode in ("inference", "training"):
+        assert all(math.isfinite(value) and value > 0 for value in result[mode]["whole"].values())
+        assert result[mode]["whole"]["ratio"] == pytest.approx(result[mode]["whole"]["pytorch_s"] / result[mode]["whole"]["ours_s"])
+
+
+def test_both_networks_find_the_same_poses():
+    from cmig_jax.bench.run import make_ours, make_twin
+
+    ours, twin = make_ours("tiny", "cpu").inference()(), make_twin("tiny", "cpu").inference()()
+    np.testing.assert_allclose(ours.R, twin.numpy(), atol=1e-3)
+
+
+def test_no_repetitions_is_an_error():
+    done = subprocess.run([sys.executable, "-m", "cmig_jax.bench", "--repetitions", "0"], capture_output=True, text=True, check=False)
+    assert done.returncode == 1
+    assert "expected at least 1" in done.stderr
+
+
+def test_work_is_done_in_turns_and_once_before():
+    calls = []
+    timing = in_turns(lambda: calls.append("a"), lambda: calls.append("b"), 3)
+    assert calls == ["a", "b"] * 4
+    assert Timing(4.0, 2.0, 1.1).as_json()["ratio"] == 2
+    assert timing.spread >= 1
+
+
+def test_inputs_are_a_function_of_the_seed():
+    first, again, other = (make_arrays(CASES["tiny"], seed) for seed in (0, 0, 1))
+    assert first.source.shape == (2, 24, 3)
+    assert (first.views.shape, first.views.dtype) == ((2, 2, 16, 16), np.uint8)
+    np.testing.assert_array_equal(first.views, again.views)
+    assert not np.array_equal(first.source, other.source)
+
+
+@pytest.mark.skipif(not Path("/proc/self/status").exists(), reason="the system does not say how much memory a process holds")
+def test_memory_is_read_from_the_system():
+    assert resident("VmHWM") >= resident("VmRSS") > 10e6
+
+
+def test_clouds_of_no_size_are_measured_in_no_process():
+    assert measure_clouds(()) == []

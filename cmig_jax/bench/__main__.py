@@ -45,9 +45,11 @@ def main(
         print("\n".join(cloud_lines(results["clouds"])))
     else:
         cache = use_compilation_cache()
-        results = run(cases, repetitions, device, rows, memory, stages)
-        print("\n".join(line for name in cases for line in case_lines(name, results[name])))
         print(f"persistent compilation cache: {cache}")
+        results = {}
+        for name in cases:
+            results[name] = run(name, repetitions, device, rows, memory, stages)
+            print("\n".join(case_lines(name, results[name])), flush=True)
     if json is not None:
         header = {"device": device, "repetitions": repetitions, "rows": rows, "jax": jax.__version__}
         json.write_text(serialiser.dumps(header | results, indent=1) + "\n")

@@ -1,9 +1,8 @@
-"""Measure the cases one after another."""
+"""Measure one case: times in turns, memory in separate processes."""
 
 from __future__ import annotations
 
 import os
-from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
@@ -20,11 +19,11 @@ from cmig_jax.parity.twin_bench import TwinBench
 from cmig_jax.parity.twin_run import state_shapes
 
 
-def run(names: Sequence[str], repetitions: int, device: str, rows: int, memory: bool, stages: bool) -> dict[str, Any]:
-    """Measure cases.
+def run(name: str, repetitions: int, device: str, rows: int, memory: bool, stages: bool) -> dict[str, Any]:
+    """Measure a case.
 
     Args:
-        names: of the cases.
+        name: of the case.
         repetitions: of each measurement; medians are reported.
         device: `cpu` or `gpu`.
         rows: `compute.rows` of ours.
@@ -32,17 +31,12 @@ def run(names: Sequence[str], repetitions: int, device: str, rows: int, memory: 
         stages: also time each stage alone.
 
     Returns:
-        for every case `inference` and `training`, each with `whole` and the stages (`ratio`, `pytorch_s`, `ours_s`), `memory` of a
-        training step, `memory_inference`, and `compile_s`; `ratio` is PyTorch over ours.
+        `inference` and `training`, each with `whole` and the stages (`ratio`, `pytorch_s`, `ours_s`), `memory` of a training step,
+        `memory_inference`, and `compile_s`; `ratio` is PyTorch over ours.
     """
-    results: dict[str, Any] = {}
-    for name in names:
-        results[name] = _times(name, repetitions, device, rows, stages)
-        if memory:
-            results[name] |= {
-                "memory": _memory(name, "training", device, rows),
-                "memory_inference": _memory(name, "inference", device, rows),
-            }
+    results = _times(name, repetitions, device, rows, stages)
+    if memory:
+        results |= {"memory": _memory(name, "training", device, rows), "memory_inference": _memory(name, "inference", device, rows)}
     return results
 
 

@@ -1,18 +1,16 @@
 """Trained networks in one file: what `load` reads when it is not given a run folder, and the network that comes with the package.
 
 A weights file is a NumPy archive of the network's variables in half precision, and its config as JSON.
-`python -m cmig_jax.weights RUN_FOLDER FILE.npz` writes one.
+`python -m cmig_jax.export RUN_FOLDER FILE.npz` writes one.
 """
 
 from __future__ import annotations
 
-import sys
 import zipfile
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
-import jax
 import jax.numpy as jnp
 import numpy as np
 from flax import traverse_util
@@ -49,7 +47,7 @@ def read_weights(path: Path) -> tuple[Config, int, dict[str, Any]]:
         ValueError: not such a file, or damaged; the message names it.
     """
     try:
-        with np.load(path, allow_pickle=False) as archive:
+        with path.open("rb") as file, np.load(file, allow_pickle=False) as archive:
             config = from_json(str(archive[CONFIG]))
             flat = {name: jnp.asarray(archive[name], jnp.float32) for name in archive.files if "/" in name}
             step = int(archive[STEP])
@@ -74,24 +72,3 @@ def check_variables(variables: Mapping[str, Any], like: Mapping[str, Any], where
 def _shapes(tree: Mapping[str, Any]) -> dict[str, tuple[int, ...]]:
     flat: dict[str, Any] = traverse_util.flatten_dict(dict(tree), sep="/")  # pyright: ignore[reportAssignmentType]
     return {name: value.shape for name, value in flat.items()}
-
-
-def main(arguments: list[str]) -> int:
-    """Write the best checkpoint of a run folder into a weights file."""
-    from cmig_jax.registration import load
-
-    if len(arguments) != 2:
-        print("usage: python -m cmig_jax.weights RUN_FOLDER FILE.npz", file=sys.stderr)
-        return 2
-    try:
-        network = load(arguments[0])
-        write_weights(Path(arguments[1]), network.config, network.step, jax.device_get(network.variables))
-    except (ValueError, OSError) as error:
-        print(f"error: {error}", file=sys.stderr)
-        return 2
-    print(f"{arguments[1]}: the network of {arguments[0]} after {network.step} steps")
-    return 0
-
-
-if __name__ == "__main__":
-    raise SystemExit(main(sys.argv[1:]))

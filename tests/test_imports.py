@@ -7,7 +7,7 @@ from pathlib import Path
 import pytest
 
 ROOT = Path(__file__).parents[1]
-TOP = {"registration", "evaluation", "baselines", "parity", "report", "configs", "bench", "train", "evaluate", "cmig_jax"}
+TOP = {"registration", "export", "evaluation", "baselines", "parity", "report", "configs", "bench", "train", "evaluate", "cmig_jax"}
 BELOW = {
     "config": set(),
     "structs": set(),
@@ -16,6 +16,7 @@ BELOW = {
     "nn": {"structs", "geometry"},
     "losses": {"structs", "geometry", "config"},
     "metrics": {"structs", "geometry"},
+    "weights": {"config"},
     "training": {"config", "structs", "data", "geometry", "nn", "losses", "metrics"},
 }
 EVERYTHING = set(BELOW) | TOP

@@ -32,7 +32,7 @@ def test_the_command_line_writes_the_keys_with_finite_ratios(tmp_path):
 
 
 def test_both_networks_find_the_same_poses():
-    from cmig_jax.bench.run import make_ours, make_twin
+    from cmig_jax.bench.networks import make_ours, make_twin
 
     ours, twin = make_ours("tiny", "cpu").inference()(), make_twin("tiny", "cpu").inference()()
     np.testing.assert_allclose(ours.R, twin.numpy(), atol=1e-3)

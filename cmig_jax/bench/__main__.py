@@ -12,7 +12,8 @@ import tyro
 
 from cmig_jax.bench.cases import CASES
 from cmig_jax.bench.clouds import measure_clouds
-from cmig_jax.bench.run import run, use_compilation_cache
+from cmig_jax.bench.networks import use_compilation_cache
+from cmig_jax.bench.run import run
 
 
 def main(

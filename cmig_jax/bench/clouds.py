@@ -12,8 +12,8 @@ import jax
 
 from cmig_jax.bench.cases import CASES, make_arrays
 from cmig_jax.bench.memory import in_a_process, resident
+from cmig_jax.bench.networks import use_compilation_cache
 from cmig_jax.bench.ours import Ours
-from cmig_jax.bench.run import use_compilation_cache
 from cmig_jax.config import ComputeConfig
 
 SIZES = (512, 1024, 2048, 5000, 10000)

@@ -45,7 +45,7 @@ def resident(field: Literal["VmHWM", "VmRSS"]) -> int:
 
 def main(case_name: str, who: Who, what: str, device: str, rows: int) -> dict[str, float]:
     """Do it twice in this process; return the peaks."""
-    from cmig_jax.bench.run import make_ours, make_twin  # torch or jax are loaded here, by the process that is measured
+    from cmig_jax.bench.networks import make_ours, make_twin  # torch or jax are loaded here, by the process that is measured
 
     if who == "ours":
         network: Any = make_ours(case_name, device, rows)

@@ -2,21 +2,13 @@
 
 from __future__ import annotations
 
-import os
-from pathlib import Path
 from typing import Any
 
-import jax
 from tqdm import tqdm
 
-from cmig_jax.bench.cases import CASES, make_arrays
 from cmig_jax.bench.clock import in_turns
 from cmig_jax.bench.memory import measure
-from cmig_jax.bench.ours import Ours
-from cmig_jax.config import ComputeConfig
-from cmig_jax.parity.recorded import named_weights
-from cmig_jax.parity.twin_bench import TwinBench
-from cmig_jax.parity.twin_run import state_shapes
+from cmig_jax.bench.networks import make_ours, make_twin
 
 
 def run(name: str, repetitions: int, device: str, rows: int, memory: bool, stages: bool) -> dict[str, Any]:
@@ -38,30 +30,6 @@ def run(name: str, repetitions: int, device: str, rows: int, memory: bool, stage
     if memory:
         results |= {"memory": _memory(name, "training", device, rows), "memory_inference": _memory(name, "inference", device, rows)}
     return results
-
-
-def use_compilation_cache() -> str:
-    """Keep compiled programs on disk; return the folder (JAX_COMPILATION_CACHE_DIR, if that is set)."""
-    folder = os.environ.get("JAX_COMPILATION_CACHE_DIR") or str(Path.home() / ".cache" / "cmig_jax" / "compiled")
-    jax.config.update("jax_compilation_cache_dir", folder)
-    return folder
-
-
-def make_ours(name: str, device: str, rows: int = 0) -> Ours:
-    """Build our network on a case's inputs."""
-    use_compilation_cache()
-    jax.config.update("jax_platforms", "cuda" if device == "gpu" else "cpu")
-    return Ours(CASES[name], make_arrays(CASES[name]), ComputeConfig(rows=rows))
-
-
-def make_twin(name: str, device: str) -> TwinBench:
-    """Build the twin on a case's inputs, with the same weights."""
-    case, arrays = CASES[name], make_arrays(CASES[name])
-    images = arrays.views if case.images else arrays.image_features
-    state = named_weights(state_shapes(case.sizes), seed=0)
-    return TwinBench(
-        case.sizes, state, arrays.source, arrays.target, images, arrays.R, arrays.t, device="cuda" if device == "gpu" else "cpu"
-    )
 
 
 def _times(name: str, repetitions: int, device: str, rows: int, stages: bool) -> dict[str, Any]:

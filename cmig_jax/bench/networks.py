@@ -1,0 +1,39 @@
+"""Both networks on the inputs of a case, with the same weights."""
+
+from __future__ import annotations
+
+import os
+from pathlib import Path
+
+import jax
+
+from cmig_jax.bench.cases import CASES, make_arrays
+from cmig_jax.bench.ours import Ours
+from cmig_jax.config import ComputeConfig
+from cmig_jax.parity.recorded import named_weights
+from cmig_jax.parity.twin_bench import TwinBench
+from cmig_jax.parity.twin_run import state_shapes
+
+
+def use_compilation_cache() -> str:
+    """Keep compiled programs on disk; return the folder (JAX_COMPILATION_CACHE_DIR, if that is set)."""
+    folder = os.environ.get("JAX_COMPILATION_CACHE_DIR") or str(Path.home() / ".cache" / "cmig_jax" / "compiled")
+    jax.config.update("jax_compilation_cache_dir", folder)
+    return folder
+
+
+def make_ours(name: str, device: str, rows: int = 0) -> Ours:
+    """Build our network on a case's inputs."""
+    use_compilation_cache()
+    jax.config.update("jax_platforms", "cuda" if device == "gpu" else "cpu")
+    return Ours(CASES[name], make_arrays(CASES[name]), ComputeConfig(rows=rows))
+
+
+def make_twin(name: str, device: str) -> TwinBench:
+    """Build the twin on a case's inputs, with the same weights."""
+    case, arrays = CASES[name], make_arrays(CASES[name])
+    images = arrays.views if case.images else arrays.image_features
+    state = named_weights(state_shapes(case.sizes), seed=0)
+    return TwinBench(
+        case.sizes, state, arrays.source, arrays.target, images, arrays.R, arrays.t, device="cuda" if device == "gpu" else "cpu"
+    )

@@ -62,7 +62,7 @@ def clouds(tmp_path_factory) -> Path:
 
 @pytest.fixture(scope="session")
 def tiny(clouds, tmp_path_factory) -> Config:
-    """A network and data of which everything takes seconds; 18 training objects, so 4 steps an epoch."""
+    """A network and data of which everything takes seconds; 18 training objects, so 2 steps an epoch."""
     config = Config(
         name="tiny",
         data=DataConfig(source="modelnet40-hdf5", root=str(clouds), points=48, validation=0.25),
@@ -75,7 +75,7 @@ def tiny(clouds, tmp_path_factory) -> Config:
             matching=MatchingConfig(iterations=1, feature_widths=(8,), coordinate_widths=(8,)),
         ),
         loss=LossConfig(cross_modal="nt-xent", match_mean="positive"),
-        optim=OptimConfig(learning_rate=1e-3, epochs=2, batch=4, milestones=(1,)),
+        optim=OptimConfig(learning_rate=1e-3, epochs=4, batch=8, milestones=(2,), validate_every=2),
     )
     prepared = prepare(config, tmp_path_factory.mktemp("prepared"), workers=1, progress=False)
     return dataclasses.replace(config, data=dataclasses.replace(config.data, prepared=str(prepared)))
@@ -139,7 +139,6 @@ def flags():
 
 @pytest.fixture(scope="session")
 def trained(command_line, flags, tiny, tmp_path_factory) -> tuple[Path, subprocess.CompletedProcess[str]]:
-    """A run of one epoch from the command line: its folder, and what it printed."""
+    """A run from the command line: its folder, and what it printed."""
     runs = tmp_path_factory.mktemp("runs")
-    config = dataclasses.replace(tiny, optim=dataclasses.replace(tiny.optim, epochs=1))
-    return runs / "tiny", command_line("train.py", "quickstart", *flags(config), "--runs", runs, "--devices", 1)
+    return runs / "tiny", command_line("train.py", "quickstart", *flags(tiny), "--runs", runs, "--devices", 1)

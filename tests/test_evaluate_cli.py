@@ -45,7 +45,9 @@ def test_results_name_every_method_and_metric(results):
 def test_results_hold_what_made_them(results, evaluated, tiny):
     assert results["command"] == f"python evaluate.py {evaluated[0]} --limit 4 --batch 4"
     assert results["config"]["data"]["points"] == tiny.data.points
-    assert results["config"]["checkpoint"] == {"which": "best", "step": 4}
+    validated = [json.loads(line) for line in (evaluated[0] / "log.jsonl").read_text().splitlines() if "val_rmse_r_deg" in line]
+    best = min(validated, key=lambda line: line["val_rmse_r_deg"])
+    assert results["config"]["checkpoint"] == {"which": "best", "step": best["step"]}
 
 
 def test_the_table_is_printed_and_nothing_is_left_over(evaluated):

@@ -17,7 +17,7 @@ from cmig_jax.training.mesh import device_mesh
 from cmig_jax.training.optim import optimizer
 from cmig_jax.training.state import abstract_state
 
-TOTAL = 8  # two epochs of four steps
+TOTAL = 8  # four epochs of two steps
 
 
 class Killed(BaseException):
@@ -105,7 +105,7 @@ def test_a_run_writes_its_config_log_curves_and_checkpoints(tiny, uninterrupted)
     assert [line["step"] for line in found if "loss" in line] == list(range(1, TOTAL + 1))
     assert [line["step"] for line in found if "val_rmse_r_deg" in line] == [4, 8]
     assert {"overlap", "cross_modal", "mask", "gradient_norm", "epoch", "learning_rate", "pairs_per_second"} <= set(found[0])
-    assert found[3]["epoch"] == 1
+    assert found[3]["epoch"] == 2
     np.testing.assert_allclose([line["learning_rate"] for line in found if "loss" in line], [1e-3] * 4 + [5e-4] * 4, rtol=1e-6)
     assert any(path.stat().st_size > 500 for path in (uninterrupted / "tensorboard").iterdir())
     assert last_state(tiny, uninterrupted).step == TOTAL

@@ -1,12 +1,10 @@
 """The training step: the same on any number of devices, compiled once, safe against bad numbers."""
 
-import dataclasses
-
 import jax
 import numpy as np
 import pytest
 
-from cmig_jax.data.loader import stack
+from cmig_jax.data.loader import epoch_steps, stack
 from cmig_jax.nn.build import build
 from cmig_jax.training.loop import training_data
 from cmig_jax.training.mesh import device_mesh, replicated, to_device
@@ -17,28 +15,23 @@ BATCH = 8
 
 
 @pytest.fixture(scope="module")
-def config(tiny):
-    return dataclasses.replace(tiny, optim=dataclasses.replace(tiny.optim, batch=BATCH))
-
-
-@pytest.fixture(scope="module")
-def batches(config):
-    pairs = training_data(config).train
+def batches(tiny):
+    pairs = training_data(tiny).train
     return [stack([pairs[i] for i in range(start, start + BATCH)]) for start in (0, BATCH)]
 
 
 @pytest.fixture(scope="module")
-def parts(config):
-    model, rule = build(config), optimizer(config.optim, 4)
+def parts(tiny):
+    model, rule = build(tiny), optimizer(tiny.optim, epoch_steps(training_data(tiny).train, tiny))
     mesh = device_mesh(BATCH, 1)
-    return model, rule, mesh, make_step(model, rule, config, mesh)
+    return model, rule, mesh, make_step(model, rule, tiny, mesh)
 
 
 @pytest.fixture(scope="module")
-def initial(config, parts):
+def initial(tiny, parts):
     """A first state, as NumPy arrays, which no step can donate."""
     model, rule, mesh, _ = parts
-    return jax.tree.map(np.array, create_state(model, rule, config, mesh))
+    return jax.tree.map(np.array, create_state(model, rule, tiny, mesh))
 
 
 @pytest.fixture
@@ -58,27 +51,27 @@ def run(step, state, batches, mesh):
     return jax.tree.map(np.array, state), scalars
 
 
-def test_the_abstract_state_matches_the_created_one(config, parts, initial):
+def test_the_abstract_state_matches_the_created_one(tiny, parts, initial):
     model, rule, mesh, _ = parts
-    described = abstract_state(model, rule, config, mesh)
+    described = abstract_state(model, rule, tiny, mesh)
     assert jax.tree.structure(described) == jax.tree.structure(initial)
     found = jax.tree.map(lambda x: (x.shape, x.dtype), initial)
     assert jax.tree.map(lambda x: (x.shape, x.dtype), described) == found
     assert {x.sharding for x in jax.tree.leaves(described)} == {replicated(mesh)}
 
 
-def test_the_state_is_a_function_of_the_seed(config, parts, initial):
+def test_the_state_is_a_function_of_the_seed(tiny, parts, initial):
     model, rule, mesh, _ = parts
-    again = create_state(model, rule, config, mesh)
+    again = create_state(model, rule, tiny, mesh)
     jax.tree.map(np.testing.assert_array_equal, again, initial)
 
 
-def test_eight_devices_equal_one(config, parts, initial, batches):
+def test_eight_devices_equal_one(tiny, parts, initial, batches):
     model, rule, mesh, step = parts
     eight = device_mesh(BATCH, 8)
     assert len(jax.devices()) == eight.size == 8
     # Compiled with few optimisations, in half the time.
-    lowered = make_step(model, rule, config, eight).lower(placed(initial, eight), to_device(batches[0], eight))
+    lowered = make_step(model, rule, tiny, eight).lower(placed(initial, eight), to_device(batches[0], eight))
     step_of_eight = lowered.compile({"xla_backend_optimization_level": 0})
     one_first, one_scalars = run(step, placed(initial, mesh), batches[:1], mesh)
     all_first, all_scalars = run(step_of_eight, placed(initial, eight), batches[:1], eight)
@@ -96,7 +89,7 @@ def test_eight_devices_equal_one(config, parts, initial, batches):
     # Adam divides a gradient by its own size: where it is 0 up to rounding (a bias before a normalisation) its sign, and so a step of
     # up to the learning rate either way, is chance. Those are few; the second step's numbers inherit them.
     apart, moved = (np.abs(flat(one_state.params) - flat(state.params)) for state in (all_state, initial))
-    rate = config.optim.learning_rate
+    rate = tiny.optim.learning_rate
     assert apart.max() <= 4.01 * rate
     assert np.mean(apart > 0.1 * rate) < 0.05
     assert np.median(moved) > 0.5 * rate, "two steps must move the parameters for this to say anything"

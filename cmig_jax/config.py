@@ -210,7 +210,8 @@ class ComputeConfig:
     precision: Literal["float32", "bfloat16"] = "float32"
     """Layers' precision; geometry, normalisation statistics and losses stay in float32."""
     rows: int = 0
-    """Rows per chunk of kNN, attention and matching, which bounds memory; in training the matching is recomputed instead. 0: whole."""
+    """Largest number of rows per chunk of kNN, attention and matching, which bounds memory. 0: kNN and attention whole, matching in
+    chunks that suit the machine."""
 
 
 @dataclass(frozen=True)

@@ -100,7 +100,7 @@ class PCRNetHead(nn.Module):
     def __call__(self, source: KeypointSet, target: KeypointSet) -> RigidTransform:
         """Return target_from_source `[B]` for this iteration."""
         encode = MLP((self.width, self.width), dtype=self.dtype, name="encode")
-        pooled = [jnp.max(encode(jnp.concatenate([s.points, s.features], axis=-1)), axis=-2) for s in (source, target)]
+        pooled = [maximum(encode(jnp.concatenate([s.points, s.features], axis=-1)), 1) for s in (source, target)]
         pose = MLP((self.width, self.width // 2, 7), dtype=self.dtype, name="pose")(jnp.concatenate(pooled, axis=-1))
         pose = pose.astype(source.points.dtype)
         upright = jnp.broadcast_to(jnp.array([1, 0, 0, 0], pose.dtype), (*pose.shape[:-1], 4))

@@ -46,10 +46,12 @@ def run(config):
     if config.views.of == "both":
         assert batch.views is not None
         batch = Batch(batch.source, batch.target, jnp.concatenate([batch.views, batch.views], axis=1), batch.target_from_source)
-    own = traverse_util.flatten_dict(jax.jit(lambda key: network.init(key, batch, train=False))(jax.random.key(0)))
+    shapes = traverse_util.flatten_dict(jax.eval_shape(lambda key: network.init(key, batch, train=False), jax.random.key(0)))
     shared = traverse_util.flatten_dict(to_flax(STATE, SIZES).variables)
-    assert set(shared) <= set(own)  # everything that the released network has
-    variables = traverse_util.unflatten_dict(own | {path: jnp.asarray(value) for path, value in shared.items()})
+    assert set(shared) <= set(shapes)  # everything that the released network has
+    rng = np.random.default_rng(0)
+    own = {path: 0.1 * rng.standard_normal(x.shape) for path, x in shapes.items() if path not in shared}
+    variables = jax.tree.map(jnp.asarray, traverse_util.unflatten_dict(own | shared))
 
     def apply(variables):
         def transformer(module, _):

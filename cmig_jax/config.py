@@ -19,8 +19,12 @@ Categories = Literal["all", "first-half", "second-half"]
 class DataConfig:
     """Objects and the protocol that turns an object into a pair (Sec. IV-A, IV-B)."""
 
-    source: Literal["shapes", "modelnet40-hdf5", "meshes", "stanford", "sevenscenes"] = "modelnet40-hdf5"
-    """Kind of data: generated shapes, ModelNet40 HDF5 files, a folder per category of meshes or clouds, Stanford scans, 7Scenes."""
+    source: Literal["shapes", "modelnet40-hdf5", "meshes", "stanford", "sevenscenes", "stanford-scans", "sevenscenes-fragments"] = (
+        "modelnet40-hdf5"
+    )
+    """Kind of data: generated shapes, ModelNet40 HDF5 files, a folder per category of meshes or clouds, Stanford models, 7-Scenes
+    fragments as objects; or, to evaluate on, recorded pairs with their true pose: Stanford's raw scans, neighbouring 7-Scenes fragments.
+    Of the flags below these know `prepared`, `points`, `keep`, `max-angle-deg` (pairs that turn by more are left out), `test-seed`."""
     root: str | None = None
     """Folder of the raw data (`shapes` needs none)."""
     prepared: str | None = None
@@ -29,16 +33,19 @@ class DataConfig:
     """Categories to train and validate on (labels below half of them are the first half)."""
     test_categories: Categories = "all"
     """Categories to test on; `second-half` after training on `first-half` is the unseen protocol (Sec. IV-B)."""
+    exclude: tuple[str, ...] = ()
+    """Names of categories to leave out of training, validation and test, such as those of symmetric objects."""
     shapes: int = 40
     """Generated objects per category and split, for `source=shapes`; the test split has a quarter as many."""
     points: int = 1024
     """Points per object before the crop (Sec. IV-B)."""
-    sampling: Literal["once", "twice"] = "once"
-    """`once`: both clouds start from the same points; `twice`: from independent samplings."""
+    sampling: Literal["once", "twice", "subsets"] = "once"
+    """`once`: both clouds start from the same points; `twice`: from independent samplings, no point in both; `subsets`: each from a
+    random subset of all prepared points of the object, so that some points are in both (RPM-Net)."""
     keep: float = 0.75
     """Share of the points that the crop keeps (Sec. IV-B removes 25 %)."""
-    crop: Literal["shared", "independent", "none"] = "shared"
-    """Far point of the crop: one for both clouds, one each (lower overlap), or no crop."""
+    crop: Literal["shared", "independent", "half-space", "none"] = "shared"
+    """Far point of the crop: one for both clouds, one each (lower overlap), a random half-space each (RPM-Net), or no crop."""
     noise_std: float = 0.01
     """Standard deviation of the Gaussian noise on every coordinate, in object units; 0 turns noise off (Sec. IV-B)."""
     noise_clip: float = 0.05
@@ -67,6 +74,8 @@ class ViewsConfig:
     """Height and width of a view, pixels."""
     layout: Literal["dodecahedron", "ring", "axes"] = "dodecahedron"
     """Where the cameras stand on the unit sphere."""
+    shown: Literal["real", "shuffled", "zero"] = "real"
+    """Views the network is given: the pair's own, those of another object, or black ones. Tests whether the images matter."""
 
 
 @dataclass(frozen=True)
@@ -113,6 +122,8 @@ class KeypointsConfig:
     """Keypoints at evaluation: highest scores, random points, or every point."""
     count: int = 256
     """Keypoints K per cloud."""
+    test_count: int = 0
+    """Keypoints K at evaluation, at most all points; 0: as many as in training."""
     score_from: Literal["own", "other"] = "own"
     """Whose point features score a cloud's points; `other` (the released network) needs clouds of equal size."""
     activation: Literal["linear", "sigmoid"] = "linear"
@@ -127,6 +138,8 @@ class MatchingConfig:
     """Features and coordinates apart (the paper's), together (IDAM), or a regression of the pose (PCRNet)."""
     iterations: int = 3
     """Iterations n, each with its own weights."""
+    repeats: int = 0
+    """Further iterations at evaluation, with the weights of the last; 0 is the paper's."""
     feature_widths: tuple[int, ...] = (256, 128, 64, 32, 32, 32)
     """Channels of the feature similarity network."""
     coordinate_widths: tuple[int, ...] = (32, 32, 32)
@@ -261,6 +274,7 @@ def _rules(c: Config) -> list[tuple[str, bool, str]]:
             m.keypoints.select == "all" or 2 <= m.keypoints.count <= kept,
             f"2 to {kept}, the points that are left after the crop",
         ),
+        (f"model.keypoints.test_count = {m.keypoints.test_count}", m.keypoints.test_count >= 0, "0 (as in training) or more"),
         (f"model.points.widths = {m.points.widths}", _positive(m.points.widths), "one or more numbers above 0"),
         (f"model.points.dim = {m.points.dim}", m.points.dim >= 4, "at least 4"),
         (
@@ -295,6 +309,7 @@ def _rules(c: Config) -> list[tuple[str, bool, str]]:
             "one or more numbers above 0",
         ),
         (f"model.matching.iterations = {m.matching.iterations}", m.matching.iterations >= 1, "at least 1"),
+        (f"model.matching.repeats = {m.matching.repeats}", m.matching.repeats >= 0, "0 (none) or more"),
         (f"loss.overlap_threshold = {c.loss.overlap_threshold}", c.loss.overlap_threshold > 0, "above 0"),
         (f"loss.match_threshold = {c.loss.match_threshold}", c.loss.match_threshold > 0, "above 0"),
         (f"loss.margins = {c.loss.margins}", min(c.loss.margins) >= 0, "two distances, 0 or more"),
@@ -327,7 +342,8 @@ def from_json(text: str) -> Config:
     """Read what `to_json` wrote.
 
     Raises:
-        ValueError: not JSON, an unknown or missing flag, or a value outside its choices; the message names the flag.
+        ValueError: not JSON, an unknown flag, or a value outside its choices; the message names the flag. A flag that is missing, since
+            it is younger than the file, has its default, which is what was done before there was the flag.
     """
     try:
         values = json.loads(text)
@@ -340,10 +356,9 @@ def _build(kind: type, values: Any, where: str) -> Any:
     if not isinstance(values, Mapping):
         raise ValueError(f"{where} = {values!r}: expected an object of flags")
     hints = get_type_hints(kind)
-    if set(values) != set(hints):
-        unknown, missing = sorted(set(values) - set(hints)), sorted(set(hints) - set(values))
-        raise ValueError(f"{where}: unknown flags {unknown}, missing flags {missing}: this config is of another version")
-    return kind(**{name: _value(hint, values[name], f"{where}.{name}") for name, hint in hints.items()})
+    if unknown := sorted(set(values) - set(hints)):
+        raise ValueError(f"{where}: unknown flags {unknown}: this config is of another version")
+    return kind(**{name: _value(hints[name], value, f"{where}.{name}") for name, value in values.items()})
 
 
 def _value(hint: Any, value: Any, where: str) -> Any:
@@ -356,7 +371,8 @@ def _value(hint: Any, value: Any, where: str) -> Any:
     if get_origin(hint) is tuple:
         kinds = get_args(hint)
         if not isinstance(value, list) or (kinds[-1] is not ... and len(value) != len(kinds)):
-            raise ValueError(f"{where} = {value!r}: expected a list of {'' if kinds[-1] is ... else len(kinds)} numbers")
+            items = "names" if kinds[0] is str else "numbers"
+            raise ValueError(f"{where} = {value!r}: expected a list of {'' if kinds[-1] is ... else f'{len(kinds)} '}{items}")
         return tuple(_value(kinds[0], item, f"{where}[{i}]") for i, item in enumerate(value))
     allowed = get_args(hint) or (hint,)
     if float in allowed and type(value) is int:

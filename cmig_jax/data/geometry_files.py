@@ -1,6 +1,7 @@
 """One file, one geometry: OFF, OBJ, PLY, STL and NPY; and folders of such files by category.
 
-ModelNet40 (Sec. IV-B) comes as `<category>/{train,test}/*.off`; some of its files run the header into the counts (`OFF490 518 0`).
+Download: ModelNet40 (Sec. IV-B) from the Princeton ModelNet page; the unpacked folder is the root (`docs/data.md`). It comes as
+`<category>/{train,test}/*.off`; some of its files run the header into the counts (`OFF490 518 0`).
 """
 
 from __future__ import annotations

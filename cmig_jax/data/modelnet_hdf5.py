@@ -1,6 +1,7 @@
 """ModelNet40 as HDF5 (Sec. IV-B): `ply_data_{train,test}*.h5` with `data` `[n, 2048, 3]` and `label` `[n, 1]`, and `shape_names.txt`.
 
-The points of an object are centred, scaled to the unit sphere and in random order.
+Download: `modelnet40_ply_hdf5_2048`, the release of PointNet's authors; the unpacked folder is the root (`docs/data.md`). The points of an
+object are centred, scaled to the unit sphere and in random order.
 """
 
 from __future__ import annotations

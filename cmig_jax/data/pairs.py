@@ -6,7 +6,7 @@ uint8, `object [P, 3]` the complete clean object in the source's frame, `label` 
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Collection, Sequence
 from typing import Any, Literal, Protocol
 
 import numpy as np
@@ -17,6 +17,8 @@ from cmig_jax.data.render import render_views
 
 Pair = dict[str, Any]
 FAR = 500.0  # distance factor of the crop's far point: from there, "nearest" is a half-space to within rounding
+SYMMETRIC = ("bottle", "bowl", "cone", "cup", "flower_pot", "lamp", "tent", "vase")
+"""ModelNet40's categories whose objects turn into themselves: without them 32 are left, a protocol of the literature (`data.exclude`)."""
 
 
 class Objects(Protocol):
@@ -63,12 +65,29 @@ class Pairs(Sequence[Pair]):
             raise IndexError(position)
         return self.draw(position % len(self), np.random.default_rng([self.seed, position % len(self)]))
 
+    @property
+    def categories(self) -> Sequence[str]:
+        """Names of the categories that `label` counts."""
+        return self.objects.categories
+
     def draw(self, position: int, rng: np.random.Generator) -> Pair:
-        """Make a pair of the object at `position` with random numbers of the caller's."""
+        """Make a pair of the object at `position` with random numbers of the caller's; `views.shown` changes nothing but its views."""
         pair = make_pair(self.objects, int(self.indices[position]), self.config.data, rng)
         if self.with_views:
-            pair["views"] = observe(self.objects, pair, self.config.views)
+            pair["views"] = self._shown(pair, rng)
         return pair
+
+    def _shown(self, pair: Pair, rng: np.random.Generator) -> np.ndarray:
+        """Return the views that `views.shown` asks for; `rng` has made the pair, so that drawing on cannot change it."""
+        views = self.config.views
+        if views.shown == "zero":
+            return black(views)
+        if views.shown == "shuffled":
+            others = self.indices[self.indices != pair["index"]]
+            if len(others) == 0:
+                raise ValueError(f"views.shown=shuffled with object {pair['index']} alone: expected at least one other object")
+            pair = make_pair(self.objects, int(rng.choice(others)), self.config.data, rng)
+        return observe(self.objects, pair, views)
 
 
 def make_pair(objects: Objects, index: int, data: DataConfig, rng: np.random.Generator) -> Pair:
@@ -84,7 +103,7 @@ def make_pair(objects: Objects, index: int, data: DataConfig, rng: np.random.Gen
         ValueError: the object has too few points for `data.points` and `data.sampling`.
     """
     points = objects.points(index)
-    source, target = samplings(points, data.points, data.sampling, index)
+    source, target = samplings(points, data.points, data.sampling, index, rng)
     R, t = random_pose(rng, data.max_angle_deg, data.max_translation)
     clouds = [source, target @ R.T + t]
     clouds = [cloud[rng.permutation(len(cloud))] for cloud in clouds]
@@ -102,17 +121,26 @@ def make_pair(objects: Objects, index: int, data: DataConfig, rng: np.random.Gen
     }
 
 
-def samplings(points: np.ndarray, count: int, sampling: Literal["once", "twice"], index: int = 0) -> tuple[np.ndarray, np.ndarray]:
-    """Return the clean points of both clouds, `[count, 3]` each: the first `count` twice, or the first and the last.
+def samplings(
+    points: np.ndarray, count: int, sampling: Literal["once", "twice", "subsets"], index: int = 0, rng: np.random.Generator | None = None
+) -> tuple[np.ndarray, np.ndarray]:
+    """Return the clean points of both clouds, `[count, 3]` each.
+
+    `once`: the first `count` points twice. `twice`: the first and the last. `subsets`: two random subsets of all points, as RPM-Net
+    draws them (Yew and Lee, CVPR 2020), for which `rng` is needed.
 
     Raises:
         ValueError: fewer points than that, naming the object's `index`.
     """
-    needed = count if sampling == "once" else 2 * count
+    needed = 2 * count if sampling == "twice" else count
     if len(points) < needed:
         raise ValueError(
             f"object {index} has {len(points)} points: expected at least {needed} for data.points={count}, sampling={sampling}"
         )
+    if sampling == "subsets":
+        assert rng is not None
+        first, second = (rng.choice(len(points), count, replace=False) for _ in range(2))
+        return points[first], points[second]
     return points[:count], points[:count] if sampling == "once" else points[-count:]
 
 
@@ -124,11 +152,22 @@ def random_pose(rng: np.random.Generator, max_angle_deg: float, max_translation:
 
 
 def crop(
-    source: np.ndarray, target: np.ndarray, kind: Literal["shared", "independent", "none"], keep: float, rng: np.random.Generator
+    source: np.ndarray,
+    target: np.ndarray,
+    kind: Literal["shared", "independent", "half-space", "none"],
+    keep: float,
+    rng: np.random.Generator,
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Keep of each cloud `[N, 3]` the share `keep` nearest to a far point, the same for both or one each (lower overlap)."""
+    """Keep of each cloud `[N, 3]` the share `keep`.
+
+    `shared`, `independent`: what is nearest to a far point, the same for both or one each (lower overlap). `half-space`: what lies on
+    one side of a plane, one each, its normal uniform on the sphere (RPM-Net; there the cut comes before the noise, here after it).
+    """
     if kind == "none":
         return source, target
+    if kind == "half-space":
+        first, second = (rng.normal(size=3) for _ in range(2))
+        return keep_farthest_along(source, first, keep), keep_farthest_along(target, second, keep)
     first = far_point(rng)
     second = first if kind == "shared" else far_point(rng)
     return keep_nearest(source, first, keep), keep_nearest(target, second, keep)
@@ -146,6 +185,13 @@ def keep_nearest(points: np.ndarray, centre: np.ndarray, keep: float) -> np.ndar
     return points[np.sort(np.argpartition(distance, count - 1)[:count])]
 
 
+def keep_farthest_along(points: np.ndarray, direction: np.ndarray, keep: float) -> np.ndarray:
+    """Keep the round(keep * N) points of `[N, 3]` that lie farthest along `direction [3]`, in their order."""
+    count = round(len(points) * keep)
+    depth = -points.astype(np.float64) @ direction
+    return points[np.sort(np.argpartition(depth, count - 1)[:count])]
+
+
 def observe(objects: Objects, pair: Pair, views: ViewsConfig) -> np.ndarray:
     """Return the depth views of a pair `[S, V, H, W]` uint8: those of the object, or rendered from what the sensor saw.
 
@@ -157,18 +203,48 @@ def observe(objects: Objects, pair: Pair, views: ViewsConfig) -> np.ndarray:
         if ready is None:
             raise ValueError("views.of=object needs views rendered ahead of time: prepare the data with the same views flags")
         return np.asarray(ready)[None]
+    return render_clouds(pair, views)
+
+
+def render_clouds(pair: Pair, views: ViewsConfig) -> np.ndarray:
+    """Render what the sensor saw, `[S, V, H, W]` uint8: the source, the target, or each, as `views.of` says."""
     clouds = {"source": ["source"], "target": ["target"], "both": ["source", "target"]}[views.of]
     return np.stack([render_views(pair[c], layout=views.layout, count=views.count, size=views.size, fit=True) for c in clouds])
 
 
-def in_categories(labels: np.ndarray, categories: int, which: Categories) -> np.ndarray:
-    """Return the indices `[m]` of the objects whose label is in the named half of the categories.
+def black(views: ViewsConfig) -> np.ndarray:
+    """Return views `[S, V, H, W]` uint8 of nothing."""
+    return np.zeros((2 if views.of == "both" else 1, views.count, views.size, views.size), np.uint8)
 
-    Points, labels and views are picked by these same indices, so images cannot come from other objects.
+
+def in_categories(labels: np.ndarray, categories: Sequence[str], which: Categories, exclude: Collection[str] = ()) -> np.ndarray:
+    """Return the indices `[m]` of the objects whose label is in the named half of the categories and whose category is not excluded.
+
+    The halves are those of all categories, whatever is excluded. Points, labels and views are picked by these same indices, so images
+    cannot come from other objects.
+
+    Raises:
+        ValueError: an excluded name that is no category.
     """
-    half = categories // 2
+    if unknown := sorted(set(exclude) - set(categories)):
+        raise ValueError(f"data.exclude: {', '.join(unknown)}: expected names of categories, which are {', '.join(categories)}")
+    half = len(categories) // 2
     keep = {"all": labels >= 0, "first-half": labels < half, "second-half": labels >= half}[which]
-    return np.flatnonzero(keep)
+    left_out = [label for label, name in enumerate(categories) if name in exclude]
+    return np.flatnonzero(keep & ~np.isin(labels, left_out))
+
+
+def evenly_spaced(count: int, limit: int | None) -> np.ndarray:
+    """Return `limit` positions of `count`, evenly spaced; all of them where the limit is None, or more.
+
+    Raises:
+        ValueError: the limit is below 1.
+    """
+    if limit is None:
+        return np.arange(count)
+    if limit < 1:
+        raise ValueError(f"limit = {limit}: expected at least 1 pair")
+    return np.unique(np.linspace(0, count - 1, min(limit, count)).astype(int))
 
 
 def split_validation(indices: np.ndarray, share: float, seed: int) -> tuple[np.ndarray, np.ndarray]:

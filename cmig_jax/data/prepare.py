@@ -13,7 +13,6 @@ import concurrent.futures
 import contextlib
 import dataclasses
 import errno
-import fcntl
 import hashlib
 import json
 import multiprocessing
@@ -44,6 +43,7 @@ from cmig_jax.data.shards import (
     check_settings,
     find_fault,
     finished_shards,
+    only_one,
     read_manifest,
     replacing,
     settings_of,
@@ -79,7 +79,7 @@ def prepare(config: Config, out: str | Path, *, workers: int | None = None, prog
     settings = settings_of(config)
     raw = open_raw(config.data)
     out.mkdir(parents=True, exist_ok=True)
-    with _only_one(out):
+    with only_one(out):
         jobs = _plan(config, raw, out, finished_shards(out, settings))
         _check_space(out, jobs)
         workers = min(workers or len(os.sched_getaffinity(0)), len(jobs))
@@ -272,17 +272,6 @@ def _explaining_a_full_disk(out: Path, needed: int) -> Iterator[None]:
             raise
         free = shutil.disk_usage(out).free
         raise OSError(errno.ENOSPC, f"{out}: the disk is full: {needed} bytes needed for the next file, {free} free") from error
-
-
-@contextlib.contextmanager
-def _only_one(out: Path) -> Iterator[None]:
-    """Wait until no other process prepares this folder; the lock ends with the process, however it ends."""
-    handle = os.open(out, os.O_RDONLY)
-    try:
-        fcntl.flock(handle, fcntl.LOCK_EX)
-        yield
-    finally:
-        os.close(handle)
 
 
 @dataclass(frozen=True)

@@ -68,6 +68,40 @@ class RawDataset:
     source: str
 
 
+@dataclass(frozen=True)
+class Recording:
+    """What a sensor saw from one place, in the frame of that place.
+
+    Attributes:
+        name: unique in its dataset.
+        label: index into the categories of its dataset.
+        read: function without arguments that reads the cloud `[P, 3]` float32, in the units of the source.
+        world_from_sensor: `[4, 4]` float64, rigid, in the same units.
+    """
+
+    name: str
+    label: int
+    read: Callable[[], np.ndarray]
+    world_from_sensor: np.ndarray
+
+
+@dataclass(frozen=True)
+class RecordedDataset:
+    """The recordings of a source, to evaluate on.
+
+    Attributes:
+        categories: names by label: the scenes.
+        recordings: opening a dataset reads names and poses only.
+        candidates: positions (i, j), i < j, of recordings that may overlap.
+        source: kind of data, as in `config.DataConfig.source`.
+    """
+
+    categories: tuple[str, ...]
+    recordings: Sequence[Recording]
+    candidates: Sequence[tuple[int, int]]
+    source: str
+
+
 def existing_folder(root: str | Path | None, expected: str) -> Path:
     """Return the folder of the raw data.
 

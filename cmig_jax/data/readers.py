@@ -30,7 +30,8 @@ def open_raw(data: DataConfig) -> RawDataset:
         The categories and the objects of both splits. `stanford` and a `sevenscenes` root with one scene have no train objects.
 
     Raises:
-        ValueError: a missing folder or file, or one that is not as the source expects; the message names it.
+        ValueError: a missing folder or file, or one that is not as the source expects; the message names it. Or a source of recorded
+            pairs (`recordings.py`), which has no objects.
     """
     match data.source:
         case "shapes":
@@ -43,6 +44,11 @@ def open_raw(data: DataConfig) -> RawDataset:
             return open_stanford(data.root)
         case "sevenscenes":
             return open_sevenscenes(data.root)
+        case "stanford-scans" | "sevenscenes-fragments":
+            raise ValueError(
+                f"data.source = {data.source} has recorded pairs, no objects: it is for evaluation only "
+                f"(python evaluate.py RUN_FOLDER --data.source {data.source})"
+            )
         case _:
             raise ValueError(f"data.source = {data.source!r}: expected shapes, modelnet40-hdf5, meshes, stanford or sevenscenes")
 

@@ -84,3 +84,26 @@ def normalise(points: np.ndarray, name: object = "points") -> tuple[np.ndarray, 
     if not scale > np.finfo(np.float32).eps * np.abs(exact).max():
         raise ValueError(f"{name}: all {len(exact)} points equal {exact[0].tolist()}; expected points apart")
     return ((exact - centre) / scale).astype(np.float32), centre, scale
+
+
+def normalise_together(source: np.ndarray, target: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray, float]:
+    """Centre two clouds, each at its own mean, and scale both by one factor so that the farthest point lies on the unit sphere.
+
+    Only what each cloud shows is used, so nothing about the transform between them is given away.
+
+    Args:
+        source: `[N, 3]`, any unit.
+        target: `[M, 3]`, the same unit.
+
+    Returns:
+        Both clouds, `[N, 3]` and `[M, 3]` float64; their centres, `[3]` each; the scale. `cloud = normalised * scale + centre`.
+
+    Raises:
+        ValueError: a wrong shape, coordinates that are not finite, or all points of both clouds equal to the centres.
+    """
+    x, y = (np.asarray(check_points(cloud, name), np.float64) for cloud, name in ((source, "source"), (target, "target")))
+    centre_x, centre_y = x.mean(0), y.mean(0)
+    scale = float(max(np.linalg.norm(x - centre_x, axis=-1).max(), np.linalg.norm(y - centre_y, axis=-1).max()))
+    if not scale > 0:
+        raise ValueError(f"source and target: all points equal {centre_x.tolist()} and {centre_y.tolist()}; expected points apart")
+    return (x - centre_x) / scale, (y - centre_y) / scale, centre_x, centre_y, scale

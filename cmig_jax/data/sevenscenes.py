@@ -1,20 +1,22 @@
 """7-Scenes (Sec. IV-D): depth frames and camera poses, fused into fragments of 50 frames, each in the frame of its first camera.
 
-Frames are `frame-XXXXXX.depth.png` (16 bit, millimetres, 0 and 65535 mean no depth) and `frame-XXXXXX.pose.txt` (`[4, 4]` world from
-camera). Fragments are in metres.
+Download: RGB-D Dataset 7-Scenes (Microsoft Research), a zip per scene with a zip per sequence in it; or fragments that others have fused,
+as PLY files. `docs/data.md` says where they go. Frames are `frame-XXXXXX.depth.png` (16 bit, millimetres, 0 and 65535 mean no depth)
+and `frame-XXXXXX.pose.txt` (`[4, 4]` world from camera). Fragments are in metres.
 """
 
 from __future__ import annotations
 
-import functools
 from collections.abc import Sequence
+from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
+import trimesh
 from PIL import Image
 
 from cmig_jax.data.geometry_files import read_geometry
-from cmig_jax.data.raw import RawDataset, RawObject, existing_folder
+from cmig_jax.data.raw import RawDataset, RawObject, RecordedDataset, Recording, existing_folder
 
 FRAMES_PER_FRAGMENT = 50
 CELL = 0.01
@@ -22,6 +24,23 @@ CELL = 0.01
 _INTRINSICS = np.array([[585.0, 0, 320], [0, 585, 240], [0, 0, 1]])
 _NO_DEPTH = (0, 65535)
 _TEST_SCENE = "office"
+_EXPECTED = "a folder of scenes with frame-*.depth.png and frame-*.pose.txt, or with fragment PLYs"
+
+
+@dataclass(frozen=True)
+class _Fragment:
+    """A part of a scene: depth frames to fuse, or, found ready-made, a file."""
+
+    name: str
+    frames: tuple[Path, ...]
+    intrinsics: np.ndarray
+    file: Path | None = None
+
+    def read(self) -> trimesh.Trimesh | np.ndarray:
+        return self.fuse() if self.file is None else read_geometry(self.file)
+
+    def fuse(self) -> np.ndarray:
+        return fuse_frames(self.frames, self.intrinsics)
 
 
 def open_sevenscenes(root: str | None) -> RawDataset:
@@ -34,23 +53,39 @@ def open_sevenscenes(root: str | None) -> RawDataset:
     Raises:
         ValueError: no such folder, no frames or fragments in it, or a frame without a pose.
     """
-    folder = existing_folder(root, "a folder of scenes with frame-*.depth.png and frame-*.pose.txt, or with fragment PLYs")
-    scenes = {}
-    if any(folder.glob("frame-*.depth.png")) or any(folder.glob("seq-*")) or any(folder.glob("*.ply")):
-        scenes[folder.resolve().name] = _fragments(folder)
-    else:
-        scenes = {place.name: found for place in sorted(folder.iterdir()) if place.is_dir() and (found := _fragments(place))}
-    if not any(scenes.values()):
-        raise ValueError(f"{folder}: no frame-*.depth.png and no fragment *.ply in it; expected scenes as sub-folders, or one scene")
-    office = [name for name in scenes if _TEST_SCENE in name.lower()]
-    held = office or [max(scenes)]
+    folder = existing_folder(root, _EXPECTED)
+    scenes = _scenes(folder)
+    held = _held_out(scenes)
     objects = [
-        RawObject(f"{scene}/{name}", label, "test" if scene in held else "train", read)
+        RawObject(f"{scene}/{fragment.name}", label, "test" if scene in held else "train", fragment.read)
         for label, (scene, fragments) in enumerate(scenes.items())
-        for name, read in fragments
+        for fragment in fragments
     ]
     objects.sort(key=lambda item: item.split != "train")
     return RawDataset(tuple(scenes), tuple(objects), "sevenscenes")
+
+
+def open_fragments(root: str | None) -> RecordedDataset:
+    """Open the fragments of the test scenes (those of `open_sevenscenes`), each that follows another in its sequence a candidate with it.
+
+    Raises:
+        ValueError: no such folder, no frames in it, or a test scene of ready-made fragments, which come without poses.
+    """
+    folder = existing_folder(root, _EXPECTED)
+    scenes = _scenes(folder)
+    held = _held_out(scenes)
+    recordings, candidates = [], []
+    for label, (scene, fragments) in enumerate(scenes.items()):
+        before = None
+        for fragment in fragments if scene in held else []:
+            if not fragment.frames:
+                raise ValueError(f"{fragment.file}: a fragment without its pose; expected frame-*.depth.png with frame-*.pose.txt")
+            sequence = fragment.frames[0].parent
+            if before == sequence:
+                candidates.append((len(recordings) - 1, len(recordings)))
+            recordings.append(Recording(f"{scene}/{fragment.name}", label, fragment.fuse, _pose(fragment.frames[0])))
+            before = sequence
+    return RecordedDataset(tuple(scenes), tuple(recordings), tuple(candidates), "sevenscenes-fragments")
 
 
 def fuse_frames(depth_paths: Sequence[str | Path], intrinsics: np.ndarray = _INTRINSICS) -> np.ndarray:
@@ -81,7 +116,23 @@ def fuse_frames(depth_paths: Sequence[str | Path], intrinsics: np.ndarray = _INT
     return (fused[:, :3] / fused[:, 3:]).astype(np.float32)
 
 
-def _fragments(scene: Path) -> list[tuple[str, functools.partial]]:
+def _scenes(folder: Path) -> dict[str, list[_Fragment]]:
+    """Return the fragments of every scene, by its name."""
+    if any(folder.glob("frame-*.depth.png")) or any(folder.glob("seq-*")) or any(folder.glob("*.ply")):
+        scenes = {folder.resolve().name: _fragments(folder)}
+    else:
+        scenes = {place.name: found for place in sorted(folder.iterdir()) if place.is_dir() and (found := _fragments(place))}
+    if not any(scenes.values()):
+        raise ValueError(f"{folder}: no frame-*.depth.png and no fragment *.ply in it; expected scenes as sub-folders, or one scene")
+    return scenes
+
+
+def _held_out(scenes: dict[str, list[_Fragment]]) -> list[str]:
+    """Return the scenes to test on."""
+    return [name for name in scenes if _TEST_SCENE in name.lower()] or [max(scenes)]
+
+
+def _fragments(scene: Path) -> list[_Fragment]:
     found = []
     for place in [scene, *sorted(scene.glob("seq-*"))]:
         frames = sorted(place.glob("frame-*.depth.png"))
@@ -96,10 +147,8 @@ def _fragments(scene: Path) -> list[tuple[str, functools.partial]]:
         for number, start in enumerate(starts):
             name = f"{place.name}/fragment-{number:03d}" if place != scene else f"fragment-{number:03d}"
             chosen = tuple(frames[start : start + FRAMES_PER_FRAGMENT])
-            found.append((name, functools.partial(fuse_frames, chosen, intrinsics)))
-    if found:
-        return found
-    return [(path.name, functools.partial(read_geometry, path)) for path in sorted(scene.glob("*.ply"))]
+            found.append(_Fragment(name, chosen, intrinsics))
+    return found or [_Fragment(path.name, (), _INTRINSICS, path) for path in sorted(scene.glob("*.ply"))]
 
 
 def _intrinsics(place: Path) -> np.ndarray:

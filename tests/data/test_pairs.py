@@ -8,7 +8,21 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from cmig_jax.config import Config, DataConfig, KeypointsConfig, ModelConfig, ViewsConfig
-from cmig_jax.data.pairs import Pairs, crop, in_categories, keep_nearest, make_pair, observe, random_pose, samplings, split_validation
+from cmig_jax.data.loader import stack
+from cmig_jax.data.pairs import (
+    SYMMETRIC,
+    Pairs,
+    crop,
+    evenly_spaced,
+    in_categories,
+    keep_farthest_along,
+    keep_nearest,
+    make_pair,
+    observe,
+    random_pose,
+    samplings,
+    split_validation,
+)
 
 
 @dataclasses.dataclass
@@ -139,13 +153,75 @@ def test_sampling_twice_takes_the_first_and_the_last_points():
     assert np.linalg.norm(undone(pair)[:, None] - pair["source"][None], axis=-1).min() > 1e-4
 
 
-@pytest.mark.parametrize(("sampling", "count"), [("once", 301), ("twice", 151)])
+PINNED = {
+    "shared": ([-0.53813, -0.0845, 0.33465], [0.07484, -0.268, 0.27869], (64.12, 78.91)),
+    "independent": ([-0.53813, -0.0845, 0.33465], [0.78344, 0.04619, 0.19528], (64.12, 62.04)),
+    "none": ([-0.1134, 0.05917, 0.49153], [0.07484, -0.268, 0.27869], (68.57, 67.07)),
+    "twice": ([-0.53813, -0.0845, 0.33465], [0.33436, 0.20428, 0.29237], (64.12, 52.96)),
+}
+
+
+@pytest.mark.parametrize("protocol", PINNED)
+def test_pairs_are_those_that_earlier_results_were_measured_on(protocol):
+    flags = {"sampling": "twice"} if protocol == "twice" else {"crop": protocol}
+    pair = Pairs(Objects(), np.array([5, 2, 7]), config(DataConfig(points=100, **flags), replace(VIEWS, of="both")), 1234)[1]
+    source, target, greys = PINNED[protocol]
+    np.testing.assert_allclose(pair["source"][-1], source, atol=2e-5)
+    np.testing.assert_allclose(pair["target"][-1], target, atol=2e-5)
+    np.testing.assert_allclose(pair["R"][2], [-0.30191, 0.12848, 0.94464], atol=2e-5)
+    np.testing.assert_allclose(pair["t"], [0.39281, 0.21245, 0.31663], atol=2e-5)
+    np.testing.assert_allclose(pair["views"].mean(axis=(1, 2, 3)), greys, atol=0.5)
+
+
+@pytest.mark.parametrize(("sampling", "count"), [("once", 301), ("twice", 151), ("subsets", 301)])
 def test_an_object_of_too_few_points_is_named(sampling, count):
-    needed = count if sampling == "once" else 2 * count
+    needed = 2 * count if sampling == "twice" else count
     with pytest.raises(
         ValueError, match=f"object 3 has 300 points: expected at least {needed} for data.points={count}, sampling={sampling}"
     ):
         draw(replace(CLEAN, points=count, sampling=sampling))
+
+
+def test_subsets_are_random_and_share_some_points():
+    pair = draw(replace(CLEAN, points=200, sampling="subsets"))
+    everything = Objects().points(3)
+    shares = []
+    for cloud in (pair["source"], undone(pair)):
+        distance = np.linalg.norm(cloud[:, None] - everything[None], axis=-1)
+        assert distance.min(1).max() < 1e-5
+        assert len(set(distance.argmin(1))) == 200  # none twice
+        shares.append(set(distance.argmin(1)))
+    assert 100 < len(shares[0] & shares[1]) < 165  # 133 of 200 from 300 are expected
+    assert max(shares[0]) > 250
+
+
+@pytest.mark.parametrize("keep", [0.7, 0.501, 0.05, 1.0])
+def test_a_half_space_keeps_exactly_its_share_on_one_side_of_a_plane(keep):
+    points, direction = np.random.default_rng(0).normal(size=(1024, 3)), np.array([0.3, -2.0, 0.7])
+    kept = keep_farthest_along(points, direction, keep)
+    assert len(kept) == round(1024 * keep)
+    height = points @ direction
+    lowest = (kept @ direction).min()
+    np.testing.assert_array_equal(kept, points[height >= lowest])
+    pair = draw(DataConfig(points=100, crop="half-space", keep=keep))
+    assert len(pair["source"]) == len(pair["target"]) == round(100 * keep)
+
+
+def test_half_spaces_have_directions_uniform_on_the_sphere_one_for_each_cloud():
+    ball = np.random.default_rng(0).normal(size=(2000, 3))
+    ball /= np.linalg.norm(ball, axis=1, keepdims=True)
+    ball = np.concatenate([ball, -ball])  # without a preferred direction
+    directions = np.array([[c.mean(0) for c in crop(ball, ball, "half-space", 0.7, np.random.default_rng(i))] for i in range(400)])
+    directions /= np.linalg.norm(directions, axis=-1, keepdims=True)
+    np.testing.assert_allclose(directions.mean(0), 0, atol=0.1)
+    np.testing.assert_allclose(np.einsum("nci,ncj->cij", directions, directions) / 400, np.eye(3)[None].repeat(2, 0) / 3, atol=0.06)
+    assert abs(np.mean(np.sum(directions[:, 0] * directions[:, 1], -1))) < 0.1  # the two cuts are independent
+
+
+def test_half_spaces_overlap_as_independent_crops_do():
+    shares = shared_share("half-space")
+    assert shares.min() < 0.7
+    assert shares.max() > 0.9
 
 
 def test_noise_is_clipped_and_drawn_for_each_cloud():
@@ -204,9 +280,46 @@ def test_views_that_were_never_rendered_are_missed():
         observe(Objects(rendered=False), draw(CLEAN), VIEWS)
 
 
+def shown(how, of="object", position=2, indices=(4, 1, 4, 7), views=True):
+    pairs = Pairs(Objects(), np.array(indices), config(DataConfig(points=100), replace(VIEWS, of=of, shown=how)), 0, views)
+    return pairs[position]
+
+
+@pytest.mark.parametrize("of", ["object", "source", "both"])
+def test_what_is_shown_changes_the_views_alone(of):
+    real, shuffled, zero = (shown(how, of) for how in ("real", "shuffled", "zero"))
+    for other in (shuffled, zero):
+        assert all(np.array_equal(real[name], other[name]) for name in real if name != "views")
+        assert (other["views"].shape, other["views"].dtype) == (real["views"].shape, np.dtype(np.uint8))
+    assert not zero["views"].any()
+    assert not np.array_equal(real["views"], shuffled["views"])
+    assert shuffled["views"].any(axis=(2, 3)).all()
+    np.testing.assert_array_equal(shuffled["views"], shown("shuffled", of)["views"])
+
+
+def test_shuffled_views_are_of_any_other_object_of_the_list():
+    seen = {int(shown("shuffled", position=p, indices=[4, 1, 4, 7] * 10)["views"][0, 0, 0, 0]) for p in range(0, 40, 2)}
+    assert seen == {1, 7}
+    with pytest.raises(ValueError, match=r"views\.shown=shuffled with object 4 alone"):
+        shown("shuffled", position=0, indices=(4, 4))
+
+
+def test_shuffled_views_of_both_clouds_are_of_one_other_pair():
+    pair, rng = draw(DataConfig(points=100), seed=9), np.random.default_rng(9)
+    pairs = Pairs(Objects(), np.array([3, 8]), config(DataConfig(points=100), replace(VIEWS, of="both", shown="shuffled")), 0)
+    drawn = pairs.draw(0, rng)
+    np.testing.assert_array_equal(drawn["source"], pair["source"])
+    assert set(stack([drawn])) == {"source", "target", "R", "t", "views"}
+    replay = np.random.default_rng(9)
+    make_pair(Objects(), 3, DataConfig(points=100), replay)
+    assert replay.choice(np.array([8])) == 8
+    other = make_pair(Objects(), 8, DataConfig(points=100), replay)
+    np.testing.assert_array_equal(drawn["views"], observe(Objects(), other, replace(VIEWS, of="both")))
+
+
 def test_categories_filter_points_labels_and_views_together():
     objects = Objects()
-    halves = {which: in_categories(objects.labels, 6, which) for which in ("all", "first-half", "second-half")}
+    halves = {which: in_categories(objects.labels, objects.categories, which) for which in ("all", "first-half", "second-half")}
     np.testing.assert_array_equal(halves["all"], np.arange(12))
     np.testing.assert_array_equal(np.union1d(halves["first-half"], halves["second-half"]), np.arange(12))
     assert not set(halves["first-half"]) & set(halves["second-half"])
@@ -220,9 +333,28 @@ def test_categories_filter_points_labels_and_views_together():
 
 
 def test_forty_categories_split_at_twenty():
-    labels = np.arange(40)
-    np.testing.assert_array_equal(in_categories(labels, 40, "first-half"), np.arange(20))
-    np.testing.assert_array_equal(in_categories(labels, 40, "second-half"), np.arange(20, 40))
+    labels, names = np.arange(40), [f"category {i}" for i in range(40)]
+    np.testing.assert_array_equal(in_categories(labels, names, "first-half"), np.arange(20))
+    np.testing.assert_array_equal(in_categories(labels, names, "second-half"), np.arange(20, 40))
+
+
+def test_excluded_categories_are_left_out_and_the_halves_stay():
+    labels = np.array([0, 1, 2, 3, 4, 5, 1, 4])
+    assert in_categories(labels, "abcdef", "all", ("b", "e")).tolist() == [0, 2, 3, 5]
+    assert in_categories(labels, "abcdef", "first-half", ("b", "e")).tolist() == [0, 2]
+    assert in_categories(labels, "abcdef", "second-half", ("b", "e")).tolist() == [3, 5]
+    assert in_categories(labels, "ab", "all", ("a", "b")).tolist() == [2, 3, 4, 5, 7]
+    with pytest.raises(ValueError, match=r"data\.exclude: vase, z: expected names of categories, which are a, b, c"):
+        in_categories(labels, "abc", "all", ("z", "a", "vase"))
+    assert len(SYMMETRIC) == len(set(SYMMETRIC)) == 8
+
+
+def test_a_limit_takes_evenly_spaced_pairs():
+    assert evenly_spaced(5, None).tolist() == evenly_spaced(5, 9).tolist() == [0, 1, 2, 3, 4]
+    assert evenly_spaced(9, 3).tolist() == [0, 4, 8]
+    assert evenly_spaced(0, 3).tolist() == []
+    with pytest.raises(ValueError, match="limit = 0: expected at least 1 pair"):
+        evenly_spaced(5, 0)
 
 
 @pytest.mark.parametrize(("share", "held"), [(0.1, 10), (0.001, 1), (0.999, 99)])

@@ -5,7 +5,7 @@ import pytest
 import trimesh
 
 from cmig_jax.data.raw import RawObject
-from cmig_jax.data.sample import normalise, object_points, sample_surface
+from cmig_jax.data.sample import normalise, normalise_together, object_points, sample_surface
 
 
 def _object(geometry, **fields) -> RawObject:
@@ -131,3 +131,20 @@ def test_bad_meshes_are_errors(vertices, faces, message):
 def test_no_points_asked_for_is_an_error():
     with pytest.raises(ValueError, match="count = 0"):
         sample_surface(trimesh.creation.box(), 0, np.random.default_rng(0))
+
+
+def test_two_clouds_are_centred_each_and_scaled_together():
+    source, target = _cloud(30), 3 * _cloud(20) - 70
+    x, y, centre_x, centre_y, scale = normalise_together(source, target)
+    for cloud, normalised, centre in ((source, x, centre_x), (target, y, centre_y)):
+        np.testing.assert_allclose(normalised.mean(0), 0, atol=1e-12)
+        np.testing.assert_allclose(normalised * scale + centre, cloud, rtol=1e-6)
+    assert max(np.linalg.norm(cloud, axis=1).max() for cloud in (x, y)) == pytest.approx(1)
+    assert np.linalg.norm(x, axis=1).max() < 0.9  # the smaller cloud stays smaller
+
+
+def test_two_clouds_of_one_point_each_have_no_scale():
+    with pytest.raises(ValueError, match="all points equal"):
+        normalise_together(np.ones((4, 3)), np.zeros((5, 3)))
+    with pytest.raises(ValueError, match="target: points of shape"):
+        normalise_together(np.ones((4, 3)), np.zeros((5, 2)))

@@ -54,25 +54,29 @@ class Network:
         return data.points if data.crop == "none" else round(data.points * data.keep)
 
 
-def load(source: str | Path | None = None, which: Literal["best", "last"] = "best", batch: int = 1) -> Network:
+def load(
+    source: str | Path | None = None, which: Literal["best", "last"] = "best", batch: int = 1, *, config: Config | None = None
+) -> Network:
     """Load a trained network.
 
     Args:
         source: a run folder of `train.py`, a weights file (`cmig_jax.weights`), or None for the network that comes with the package.
         which: checkpoint of a run folder: the best on validation, or the last.
         batch: pairs per compiled call.
+        config: flags to use in place of those of the training, such as other keypoints, precision or chunks; the weights must fit.
 
     Raises:
         ValueError: no run folder, no checkpoint in it, or one that does not fit its config; the message names the file.
     """
     path = PRETRAINED if source is None else Path(source)
     if path.suffix == ".npz":
-        config, step, variables = read_weights(path)
+        trained, step, variables = read_weights(path)
+        config = config or trained
         model = build(config)
         like = abstract_state(model, optimizer(config.optim, 1), config, device_mesh(1, 1))
         check_variables(variables, like.variables, str(path))
         return Network(config=config, variables=variables, predictor=Predictor(model, batch), step=step)
-    config = read_config(path)
+    config = config or read_config(path)
     model = build(config)
     like = abstract_state(model, optimizer(config.optim, 1), config, device_mesh(1, 1))
     state = load_state(path, like, which)

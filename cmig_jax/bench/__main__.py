@@ -10,6 +10,7 @@ from typing import Any, Literal
 import jax
 import tyro
 
+from cmig_jax.allocator import keep_freed_memory
 from cmig_jax.bench.cases import CASES
 from cmig_jax.bench.clouds import measure_clouds
 from cmig_jax.bench.networks import use_compilation_cache
@@ -23,6 +24,7 @@ def main(
     rows: int = 0,
     stages: bool = True,
     memory: bool = True,
+    allocator: Literal["kept", "default"] = "kept",
     clouds: tuple[int, ...] = (),
     json: Path | None = None,
 ) -> None:
@@ -36,11 +38,14 @@ def main(
         rows: `compute.rows` of our network.
         stages: also time every stage alone.
         memory: also take peak memory, in separate processes.
+        allocator: `kept`: both networks keep the memory that they free, as `train.py` does; `default`: the C library's own ways.
         clouds: instead, register clouds of these sizes with our network (`--rows` is 512 if not given) and print time and memory.
         json: file to write the results to.
     """
     if repetitions < 1:
         sys.exit(f"error: --repetitions {repetitions}: expected at least 1")
+    if allocator == "kept":
+        keep_freed_memory()
     if clouds:
         results: dict[str, Any] = {"clouds": measure_clouds(clouds, rows or 512, device)}
         print("\n".join(cloud_lines(results["clouds"])))
@@ -52,7 +57,7 @@ def main(
             results[name] = run(name, repetitions, device, rows, memory, stages)
             print("\n".join(case_lines(name, results[name])), flush=True)
     if json is not None:
-        header = {"device": device, "repetitions": repetitions, "rows": rows, "jax": jax.__version__}
+        header = {"device": device, "repetitions": repetitions, "rows": rows, "allocator": allocator, "jax": jax.__version__}
         json.write_text(serialiser.dumps(header | results, indent=1) + "\n")
 
 

@@ -72,13 +72,15 @@ class Attention(nn.Module):
     def __call__(self, query: Array, memory: Array) -> Array:
         """Attend from `query [B, N, C]` over `memory [B, M, C]`, to `[B, N, C]`."""
 
-        def split(x: Array, name: str) -> Array:
-            y = Dense(self.dim, dtype=self.dtype, name=name)(x)
-            return y.reshape(*y.shape[:-1], self.heads, -1).swapaxes(-2, -3)
+        def split(x: Array) -> Array:
+            return x.reshape(*x.shape[:-1], self.heads, -1).swapaxes(-2, -3)
 
-        q, k, v = split(query, "query"), split(memory, "key"), split(memory, "value")
-        attended = attend(q, k, v, self.rows).swapaxes(-2, -3)
-        return Dense(self.dim, dtype=self.dtype, name="out")(attended.reshape(*attended.shape[:-2], -1)).astype(query.dtype)
+        q, k, v, out = (Dense(self.dim, dtype=self.dtype, name=name) for name in ("query", "key", "value", "out"))
+        if memory.shape[-2] == 1 and not self.is_initializing():
+            # The softmax of one number is 1: every query receives this token, whatever it asks.
+            return jnp.broadcast_to(out(v(memory)), query.shape).astype(query.dtype)
+        attended = attend(split(q(query)), split(k(memory)), split(v(memory)), self.rows).swapaxes(-2, -3)
+        return out(attended.reshape(*attended.shape[:-2], -1)).astype(query.dtype)
 
 
 def attend(query: Array, key: Array, value: Array, rows: int = 0) -> Array:

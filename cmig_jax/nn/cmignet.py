@@ -36,6 +36,9 @@ class CMIGNet(nn.Module):
             or `none`.
         cross_attention: the layer of Eq. 8, or None.
         score: significance scores (MP), or None where keypoints are not predicted.
+        keypoints: K.
+        test_keypoints: K in evaluation, at most all points; 0 is `keypoints`.
+        repeats: iterations in evaluation beyond those trained, with the weights of the last.
     """
 
     points: PointEncoder
@@ -48,6 +51,8 @@ class CMIGNet(nn.Module):
     score_from: Literal["own", "other"] = "own"
     select: Literal["predicted", "random", "all"] = "predicted"
     keypoints: int = 256
+    test_keypoints: int = 0
+    repeats: int = 0
     match_threshold: float = 0.05
     centroid: Literal["weighted", "unweighted"] = "weighted"
     pose_gradient: Literal["stopped", "through"] = "stopped"
@@ -144,14 +149,13 @@ class CMIGNet(nn.Module):
         if self.select == "all":
             every = [jnp.broadcast_to(jnp.arange(n), (B, n)) for n in (N, M)]
             return Keypoints(source_index=every[0], target_index=every[1])
+        counts = [min(self.test_keypoints, n) or self.keypoints for n in (N, M)]
         if self.select == "random":
             keys = jax.random.split(jax.random.key(0) if key is None else key)
-            return Keypoints(
-                source_index=random_points(keys[0], B, N, self.keypoints), target_index=random_points(keys[1], B, M, self.keypoints)
-            )
+            return Keypoints(source_index=random_points(keys[0], B, N, counts[0]), target_index=random_points(keys[1], B, M, counts[1]))
         assert source_scores is not None
         assert target_scores is not None
-        return Keypoints(source_index=top_scores(source_scores, self.keypoints), target_index=top_scores(target_scores, self.keypoints))
+        return Keypoints(source_index=top_scores(source_scores, counts[0]), target_index=top_scores(target_scores, counts[1]))
 
     def _training_keypoints(self, batch: Batch, key: Array | None, source_index: Array | None) -> Keypoints:
         assert batch.target_from_source is not None
@@ -168,7 +172,7 @@ class CMIGNet(nn.Module):
         """Match, solve, move the source, n times (Sec. III-E)."""
         pose = RigidTransform.identity((source.points.shape[0],), source.points.dtype)
         iterations = []
-        for head in self.heads:
+        for head in self.heads + (() if train else self.heads[-1:] * self.repeats):
             if isinstance(head, PCRNetHead):
                 iteration = Iteration(source=source.points, step=head(source, target))
             else:

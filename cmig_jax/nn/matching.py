@@ -7,6 +7,7 @@ and one from coordinates and adds them; the idam head takes one from both togeth
 from __future__ import annotations
 
 import flax.linen as nn
+import jax
 import jax.numpy as jnp
 from flax import struct
 from jax import Array
@@ -16,7 +17,8 @@ from cmig_jax.geometry.neighbors import squared_distances
 from cmig_jax.geometry.rigid import rotation_from_quaternion
 from cmig_jax.nn.mlp import MLP, Dense, NormedMLP, Weights, torch_kernel
 from cmig_jax.nn.norm import channels
-from cmig_jax.nn.pairs import PairSum, PairTerm, Tower, chunks_of, joined, sweep
+from cmig_jax.nn.pairs import PairSum, PairTerm
+from cmig_jax.nn.tower import Tower, chunks_of, joined
 from cmig_jax.structs import RigidTransform
 
 CREDIBILITY_WIDTH = 32
@@ -62,9 +64,7 @@ class CMIGNetHead(nn.Module):
         """Match source keypoints to target keypoints."""
         feature, _ = self.feature_tower(self.feature_pairs(source.features, target.features), train=train)
         coordinate, _ = self.coordinate_tower(self.coordinate_pairs(source.points, target.points, source.points), train=train)
-        B, N, M = feature.shape
-        split = chunks_of(B, N, M, self.rows)
-        pooled = joined(sweep(_best_of_targets, self.pre(), (split(feature), split(coordinate))))
+        pooled = _best_of_targets(self.pre(), feature, coordinate, self.rows)
         return Match(feature=feature, coordinate=coordinate, logit=self.credibility(pooled, train=train))
 
 
@@ -147,11 +147,23 @@ class Credibility(nn.Module):
         return Dense(1, name="last")(hidden)[..., 0]
 
 
-def _best_of_targets(parameters: tuple[Array, Array], similarities: tuple[Array, Array]) -> Array:
-    """Apply a linear layer to each pair's two similarities `[B, R, K]`, and take the maximum over targets: `[B, R, C]`."""
-    (kernel, bias), (feature, coordinate) = parameters, similarities
-    own, other = (row[None, None, None, :] for row in kernel)
-    return maximum(feature[..., None] * own + coordinate[..., None] * other + channels(bias, 4), 2)
+def _best_of_targets(parameters: tuple[Array, Array | None], feature: Array, coordinate: Array, rows: int) -> Array:
+    """Apply a linear layer to each pair's two similarities `[B, N, M]`, and take the maximum over targets: `[B, N, C]`.
+
+    Only the pairs that have the maximum are differentiated.
+    """
+    kernel, bias = parameters
+    assert bias is not None
+    B, N, M = feature.shape
+    split = chunks_of(B, N, M, CREDIBILITY_WIDTH, rows)
+
+    def best(chunk: tuple[Array, Array]) -> Array:
+        own, other = (row[None, None, None, :] for row in jax.lax.stop_gradient(kernel))
+        return jnp.argmax(chunk[0][..., None] * own + chunk[1][..., None] * other, axis=2)
+
+    index = joined(jax.lax.map(best, jax.lax.stop_gradient((split(feature), split(coordinate)))))
+    at_best = [jnp.take_along_axis(x, index, axis=2) * channels(row, 3) for x, row in zip((feature, coordinate), kernel, strict=True)]
+    return at_best[0] + at_best[1] + channels(bias, 3)
 
 
 def pair_distances(a: Array, b: Array) -> Array:

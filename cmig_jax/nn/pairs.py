@@ -1,31 +1,20 @@
-"""Networks over all pairs of keypoints, which hold a layer's activations once, and the first layer's never.
+"""Sums over all pairs of keypoints that are never stored: the first layer of the networks over pairs.
 
-The first layer is a sum of `S_ij * (a_i + b_j)` with few S (`PairSum`): its batch statistics follow from sums and products over
-points, and its values are made where they are read. Later layers go through the pairs chunk by chunk (rows of source keypoints),
-small enough to stay in the processor's cache; normalisation and ReLU are done by the layer that reads. The derivative walks the same
-chunks and computes again what it needs of each (`sweep`). In evaluation, where statistics are known, one walk does all layers.
+Such a layer is a sum of `S_ij * (a_i + b_j)` with few S (`PairSum`). Its batch statistics follow from sums and products over points,
+and its values are made where they are read, a few rows of source keypoints at a time (`nn/tower.py`).
 """
 
 from __future__ import annotations
 
-import functools
-from collections.abc import Callable
-from typing import Any
-
-import flax.linen as nn
 import jax
 import jax.numpy as jnp
 from flax import struct
 from jax import Array
 
-from cmig_jax.geometry.maximum import maximum
-from cmig_jax.nn.mlp import Weights
-from cmig_jax.nn.norm import Affine, BatchNorm, Moments, channels, moments
+from cmig_jax.nn.norm import Affine, Moments
 
 HIGHEST = jax.lax.Precision.HIGHEST
-# Pairs per chunk: a CPU's cache holds as many with 256 channels; an accelerator wants large kernels.
-PAIRS_AT_A_TIME = {"cpu": 4096}
-PAIRS_ON_ACCELERATORS = 2**20
+ROWS_TO_ADD = 32  # up to so many, one by one in one pass
 
 
 @struct.dataclass
@@ -54,11 +43,7 @@ class PairSum:
 
     def values(self) -> Array:
         """Return `[B, N, M, C]`."""
-        total = self.row[:, :, None]
-        for t in self.terms:
-            column = t.column[:, None]
-            total = total + t.scale[..., None] * (column if t.row is None else column + t.row[:, :, None])
-        return total
+        return _values(self)
 
     def moments(self) -> Moments:
         """Take mean and variance per channel from sums over points; everything is centred first, so that squares keep their digits."""
@@ -92,134 +77,41 @@ def _weighted(weight: Array, row: Array, column: Array) -> Array:
     return jnp.sum(of_row * row, axis=(0, 1)) + jnp.sum(of_column * column, axis=(0, 1))
 
 
-class Tower(nn.Module):
-    """What follows the first layer: BatchNorm and ReLU, more such layers, and one number per pair.
-
-    `pooled` also returns the last hidden layer's maximum over targets.
-    """
-
-    widths: tuple[int, ...]
-    rows: int = 0
-    pooled: bool = False
-    dtype: jnp.dtype | None = None
-
-    @nn.compact
-    def __call__(self, pairs: PairSum, *, train: bool) -> tuple[Array, Array | None]:
-        """Map pairs of `widths[0]` channels to similarities `[B, N, M]` and, if wanted, `[B, N, widths[-1]]`."""
-        wide = pairs.row.dtype
-        pairs = pairs.normalised(BatchNorm(self.widths[0], name="first_norm").affine(pairs.moments() if train else None))
-        dtype = self.dtype or wide
-        first, chunks = _chunked(pairs, self.rows)
-        layers = Hidden(self.widths, dtype, name="hidden")(first, chunks, train=train)
-        kernel, bias = Weights(self.widths[-1], 1, name="last")()
-        assert bias is not None
-
-        def last(shared: Any, chunk: Any) -> tuple[Array, Array | None]:
-            hidden = _hidden(shared[0], chunk, dtype)
-            similarity = (hidden @ shared[1].astype(dtype))[..., 0].astype(wide) + channels(shared[2], 3)
-            return similarity, maximum(hidden, 2).astype(wide) if self.pooled else None
-
-        similarity, pooled = sweep(last, (layers[0], kernel, bias), layers[1])
-        return joined(similarity), None if pooled is None else joined(pooled)
+@jax.custom_vjp
+def _values(pairs: PairSum) -> Array:
+    total = pairs.row[:, :, None]
+    for t in pairs.terms:
+        column = t.column[:, None]
+        total = total + t.scale[..., None] * (column if t.row is None else column + t.row[:, :, None])
+    return total
 
 
-class Hidden(nn.Module):
-    """Layers of linear (no bias), BatchNorm, ReLU over pairs."""
-
-    widths: tuple[int, ...]
-    dtype: jnp.dtype
-
-    @nn.compact
-    def __call__(self, first: PairSum, chunks: Any, *, train: bool) -> tuple[Any, Any]:
-        """Return what `_hidden` makes the last layer from: in training the last linear layer's values, in evaluation all weights."""
-        shared, dtype = (first, ()), self.dtype
-
-        def linear(shared: Any, chunk: Any) -> tuple[Array, Moments]:
-            y = _hidden(shared[0], chunk, dtype) @ shared[1].astype(dtype)
-            return y, moments([y])
-
-        for i, (inputs, width) in enumerate(zip(self.widths[:-1], self.widths[1:], strict=True)):
-            kernel, norm = Weights(inputs, width, use_bias=False, name=f"layer_{i}")()[0], BatchNorm(width, name=f"norm_{i}")
-            if train:
-                chunks, parts = sweep(linear, (shared, kernel), chunks)
-                shared = (None, ((None, norm.affine(_together(parts))),))
-            else:
-                shared = (shared[0], (*shared[1], (kernel, norm.affine(None))))
-        return shared, chunks
+def _values_backward(pairs: PairSum, gradient: Array) -> tuple[PairSum]:
+    """Differentiate by hand, with sums over columns and channels as products: XLA's sums take many times as long on a CPU."""
+    weights = jnp.stack([jnp.ones_like(pairs.terms[0].scale), *(t.scale for t in pairs.terms)], axis=2)
+    of_rows = jnp.einsum("bntm,bnmc->bntc", weights, gradient, precision=HIGHEST)
+    terms = []
+    for i, t in enumerate(pairs.terms, 1):
+        if t.column.shape[0] == t.column.shape[1] == 1:
+            of_column = jnp.sum(of_rows[:, :, i], axis=(0, 1), keepdims=True)
+            of_scale = jnp.matmul(gradient, t.column[0, 0], precision=HIGHEST)
+        else:
+            of_column = _sum_of_rows(t.scale, gradient)
+            of_scale = jnp.matmul(gradient * t.column[:, None], jnp.ones_like(gradient[0, 0, 0]), precision=HIGHEST)
+        if t.row is not None:
+            of_scale = of_scale + jnp.einsum("bnmc,bnc->bnm", gradient, t.row, precision=HIGHEST)
+        terms.append(PairTerm(of_scale, None if t.row is None else of_rows[:, :, i], of_column))
+    return (PairSum(of_rows[:, :, 0], tuple(terms)),)
 
 
-def _hidden(shared: Any, chunk: Any, dtype: jnp.dtype) -> Array:
-    """Make a hidden layer of a chunk: from the first layer's terms or a later one's values, through the layers in `shared`."""
-    columns, layers = shared
-    x = chunk if columns is None else nn.relu(_values(chunk, columns)).astype(dtype)
-    for kernel, affine in layers:
-        x = nn.relu(affine(x if kernel is None else x @ kernel.astype(dtype)))
-    return x
+def _sum_of_rows(weight: Array, x: Array) -> Array:
+    """Sum `weight [B, N, M]` times `x [B, N, M, C]` over N, to `[B, M, C]`."""
+    if weight.shape[1] > ROWS_TO_ADD:
+        return jnp.einsum("bnm,bnmc->bmc", weight, x, precision=HIGHEST)
+    total = weight[:, 0, :, None] * x[:, 0]
+    for i in range(1, weight.shape[1]):
+        total = total + weight[:, i, :, None] * x[:, i]
+    return total
 
 
-def _chunked(pairs: PairSum, rows: int) -> tuple[Any, Any]:
-    """Split a sum into what belongs to columns and chunks of what belongs to rows."""
-    B, N, M = pairs.terms[0].scale.shape
-    split = chunks_of(B, N, M, rows)
-    columns = tuple(t.column for t in pairs.terms)
-    return columns, (split(pairs.row), tuple((split(t.scale), None if t.row is None else split(t.row)) for t in pairs.terms))
-
-
-def _values(chunk: Any, columns: Any) -> Array:
-    row, terms = chunk
-    return PairSum(row, tuple(PairTerm(s, a, b) for (s, a), b in zip(terms, columns, strict=True))).values()
-
-
-def chunks_of(B: int, N: int, M: int, rows: int) -> Callable[[Array], Array]:
-    """Return how to split `[B, N, ...]` into chunks `[N / R, B, R, ...]`: R rows (0: as many as suit the machine) that divide N."""
-    at_a_time = PAIRS_AT_A_TIME.get(jax.default_backend(), PAIRS_ON_ACCELERATORS)
-    most = rows or max(1, at_a_time // (B * M))
-    R = max(r for r in range(1, min(most, N) + 1) if N % r == 0)
-    return lambda x: x.reshape(B, N // R, R, *x.shape[2:]).swapaxes(0, 1)
-
-
-def joined(chunks: Array) -> Array:
-    """Undo `chunks_of`: `[n, B, R, ...]` to `[B, n R, ...]`."""
-    n, B, R = chunks.shape[:3]
-    return chunks.swapaxes(0, 1).reshape(B, n * R, *chunks.shape[3:])
-
-
-def _together(parts: Moments) -> Moments:
-    """Join the moments `[n, C]` of equal chunks."""
-    mean = jnp.mean(parts.mean, axis=0)
-    variance = jnp.mean(parts.variance + (parts.mean - mean[None]) ** 2, axis=0)
-    return Moments(mean=mean, variance=variance, count=parts.count * parts.mean.shape[0])
-
-
-def sweep(function: Callable[[Any, Any], Any], shared: Any, chunks: Any) -> Any:
-    """Apply `function(shared, chunk)` to one chunk after another; the derivative keeps the inputs and computes all else again.
-
-    Args:
-        function: pure, and closed over no array.
-        shared: arrays that every chunk reads.
-        chunks: arrays with a leading axis over chunks.
-    """
-    return _sweep(function, shared, chunks)
-
-
-@functools.partial(jax.custom_vjp, nondiff_argnums=(0,))
-def _sweep(function: Callable[[Any, Any], Any], shared: Any, chunks: Any) -> Any:
-    return jax.lax.map(lambda chunk: function(shared, chunk), chunks)
-
-
-def _sweep_forward(function: Callable[[Any, Any], Any], shared: Any, chunks: Any) -> tuple[Any, tuple[Any, Any]]:
-    return _sweep(function, shared, chunks), (shared, chunks)
-
-
-def _sweep_backward(function: Callable[[Any, Any], Any], saved: tuple[Any, Any], gradient: Any) -> tuple[Any, Any]:
-    shared, chunks = saved
-
-    def visit(total: Any, at: tuple[Any, Any]) -> tuple[Any, Any]:
-        chunk, outer = at
-        of_shared, of_chunk = jax.vjp(function, shared, chunk)[1](outer)
-        return jax.tree.map(jnp.add, total, of_shared), of_chunk
-
-    return jax.lax.scan(visit, jax.tree.map(jnp.zeros_like, shared), (chunks, gradient))
-
-
-_sweep.defvjp(_sweep_forward, _sweep_backward)
+_values.defvjp(lambda pairs: (_values(pairs), pairs), _values_backward)

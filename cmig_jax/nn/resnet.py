@@ -13,6 +13,7 @@ import jax.numpy as jnp
 from jax import Array
 
 from cmig_jax.nn.norm import BatchNorm
+from cmig_jax.nn.pooling import max_pool
 
 IMAGENET_MEAN = (0.485, 0.456, 0.406)
 IMAGENET_STD = (0.229, 0.224, 0.225)
@@ -31,7 +32,7 @@ class ViewEncoder(nn.Module):
         """Encode views `[..., H, W, 1]` (uint8 depth) or `[..., H, W, 3]` (normalised RGB) to `[..., widths[-1]]`."""
         x = Stem(self.widths[0], dtype=self.dtype, name="stem")(views.reshape(-1, *views.shape[-3:]))
         x = nn.relu(BatchNorm(self.widths[0], name="stem_norm")(x, train=train))
-        x = nn.max_pool(x, (3, 3), (2, 2), padding=((1, 1), (1, 1)))  # pyright: ignore[reportArgumentType]
+        x = max_pool(x)
         for stage, (width, count) in enumerate(zip(self.widths, self.blocks, strict=True)):
             for block in range(count):
                 stride = 2 if stage > 0 and block == 0 else 1
@@ -56,7 +57,9 @@ class Stem(nn.Module):
         grey = jnp.sum(kernel / std, axis=2, keepdims=True)
         constant = jnp.sum(kernel * mean / std, axis=2, keepdims=True)
         response = self._convolve(jnp.ones((1, *images.shape[1:]), kernel.dtype), constant)
-        return self._convolve(images.astype(kernel.dtype) / 255, grey) - response
+        # As a product, so that its derivative is one too: on a CPU a sum over the first axis of a large array is many times slower.
+        repeated = jnp.einsum("b,hwc->bhwc", jnp.ones(len(images), response.dtype), response[0])
+        return self._convolve(images.astype(kernel.dtype) / 255, grey) - repeated
 
     def _convolve(self, x: Array, kernel: Array) -> Array:
         dtype = self.dtype or kernel.dtype

@@ -10,7 +10,8 @@ import pytest
 
 from cmig_jax.nn.mlp import Dense, NormedMLP
 from cmig_jax.nn.norm import BatchNorm, moments
-from cmig_jax.nn.pairs import PairSum, PairTerm, Tower, chunks_of, joined, sweep
+from cmig_jax.nn.pairs import PairSum, PairTerm
+from cmig_jax.nn.tower import Tower, chunks_of, joined, sweep
 
 WIDTHS = (6, 5, 4)
 
@@ -31,6 +32,20 @@ def pair_sum(offset=0.0, dtype=np.float64):
     direction = PairTerm(normal(2, 8, 7, seed=4) + offset, normal(2, 8, 6, seed=5), normal(2, 7, 6, seed=6))
     whole = PairSum(normal(2, 8, 6, seed=7) + offset, (length, direction))
     return jax.tree.map(lambda x: x.astype(dtype), whole)
+
+
+@pytest.mark.parametrize("rows", [3, 40])  # few are added one by one, many by a product
+def test_the_derivative_of_the_values_is_that_of_their_formula(rows):
+    def formula(row, length, direction):
+        direction = direction.scale[..., None] * (direction.row[:, :, None] + direction.column[:, None])
+        return row[:, :, None] + length.scale[..., None] * length.column[:, None] + direction
+
+    row, cotangent = normal(2, rows, 6), normal(2, rows, 7, 6, seed=1)
+    length = PairTerm(normal(2, rows, 7, seed=2), None, normal(1, 1, 6, seed=3))
+    direction = PairTerm(normal(2, rows, 7, seed=4), normal(2, rows, 6, seed=5), normal(2, 7, 6, seed=6))
+    ours = jax.jit(jax.grad(lambda p: jnp.sum(cotangent * p.values())))(PairSum(row, (length, direction)))
+    plain = jax.jit(jax.grad(lambda p: jnp.sum(cotangent * formula(p.row, *p.terms))))(PairSum(row, (length, direction)))
+    jax.tree.map(lambda x, y: np.testing.assert_allclose(x, y, atol=1e-12), ours, plain)
 
 
 class Plain(nn.Module):
@@ -102,7 +117,7 @@ def test_sums_add_and_normalise_as_their_values_do():
 @pytest.mark.parametrize("rows", [0, 1, 5, 8, 100])
 def test_chunks_join_to_the_whole(rows):
     x = normal(2, 8, 7, 3)
-    chunks = chunks_of(2, 8, 7, rows)(x)
+    chunks = chunks_of(2, 8, 7, 3, rows)(x)
     assert chunks.shape[2] <= (rows or 8)
     np.testing.assert_array_equal(joined(chunks), x)
 

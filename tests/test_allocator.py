@@ -1,0 +1,30 @@
+"""Freed memory stays with the process, where the C library can be told so."""
+
+import platform
+import subprocess
+import sys
+
+import pytest
+
+PROGRAM = """
+import resource
+import numpy as np
+from cmig_jax.allocator import keep_freed_memory
+{call}
+def faults():
+    before = resource.getrusage(resource.RUSAGE_SELF).ru_minflt
+    np.ones(64 * 2**17)
+    return resource.getrusage(resource.RUSAGE_SELF).ru_minflt - before
+faults()
+print(faults())
+"""
+
+
+def second_time(call: str) -> int:
+    """Count the pages that a process is given when it takes 64 MB for the second time."""
+    return int(subprocess.run([sys.executable, "-c", PROGRAM.format(call=call)], capture_output=True, text=True, check=True).stdout)
+
+
+@pytest.mark.skipif(platform.libc_ver()[0] != "glibc", reason="a setting of glibc")
+def test_memory_is_taken_from_the_system_once():
+    assert second_time("keep_freed_memory()") < 10 < second_time("")

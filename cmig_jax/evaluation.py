@@ -1,7 +1,8 @@
 """Every method on the same test pairs: their errors, side by side (Sec. IV-B).
 
 A pair is a dict of arrays, target = R source + t: `source` `[N, 3]`, `target` `[M, 3]`, `R` `[3, 3]`, `t` `[3]`; optionally `object`
-`[P, 3]` (complete and clean, in the source's frame), `views` `[S, V, H, W]` uint8, `label`, `index`.
+`[P, 3]` (complete and clean, in the source's frame), `views` `[S, V, H, W]` uint8, `label`, `index`, `overlap` (the share of either
+cloud that the other has too, where a data set knows it).
 """
 
 from __future__ import annotations
@@ -23,7 +24,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 from tqdm import tqdm
 
-from cmig_jax.metrics import check_poses, closest_point_error, isotropic_errors, registration_metrics
+from cmig_jax.metrics import check_poses, closest_point_error, isotropic_errors, modified_chamfer, registration_metrics
 
 Pair = Mapping[str, Any]
 Method = Callable[[list[Pair]], tuple[ArrayLike, ArrayLike]]
@@ -34,6 +35,8 @@ ERRORS = "errors.npz"
 METADATA = ("command", "config", "versions")
 """The keys of `results.json` that are not methods."""
 PARTIAL = ".evaluation"
+FORMAT = 2
+"""Of the finished chunks: those of another format are computed anew."""
 PACKAGES = ("cmig_jax", "jax", "flax", "numpy", "scipy", "small_gicp")
 
 
@@ -65,8 +68,9 @@ def evaluate(
     Returns:
         What `results.json` holds: `{"<method>": {metric: value}}` with the entries of `registration_metrics`, `seconds_per_pair` (the
         median over chunks, after a chunk for warm-up) and `pairs`; beside the methods "command", "config" and "versions".
-        `errors.npz` holds `index`, `label`, `R_true`, `t_true` and for each method `<method>/R`, `t`, `iso_r_deg`, `iso_t`,
-        `closest_point` (NaN for a pair without `object`); a pair without a label has -1.
+        `errors.npz` holds `index`, `label` (-1 for a pair without), `overlap` (NaN likewise), `R_true`, `t_true`, `angle_deg` (of
+        R_true) and for each method `<method>/R`, `t`, `iso_r_deg`, `iso_t`, `closest_point`, `chamfer` (both NaN for a pair without
+        `object`).
 
     Raises:
         ValueError: no pairs or methods, a method named like a reserved key, a pair without one of its arrays, a method's pose that is
@@ -78,7 +82,7 @@ def evaluate(
         )
     partial = folder / PARTIAL
     partial.mkdir(parents=True, exist_ok=True)
-    settings = json.dumps([config, chunk], sort_keys=True)
+    settings = json.dumps([FORMAT, config, chunk], sort_keys=True)
     done: dict[str, list[Arrays]] = {name: [] for name in methods}
     truth: list[Arrays] = []
     warm: set[str] = set()
@@ -126,7 +130,14 @@ def _truth(group: Sequence[Pair], first: int) -> Arrays:
             raise ValueError(f"pair {pair.get('index', first + i)}: {', '.join(missing)} missing, it holds {', '.join(pair)}")
     index = np.array([int(pair.get("index", first + i)) for i, pair in enumerate(group)])
     R_true, t_true = check_poses([pair["R"] for pair in group], [pair["t"] for pair in group], "true", names=index.tolist())
-    return {"index": index, "label": np.array([int(pair.get("label", -1)) for pair in group]), "R_true": R_true, "t_true": t_true}
+    return {
+        "index": index,
+        "label": np.array([int(pair.get("label", -1)) for pair in group]),
+        "overlap": np.array([float(pair.get("overlap", np.nan)) for pair in group]),
+        "R_true": R_true,
+        "t_true": t_true,
+        "angle_deg": isotropic_errors(np.broadcast_to(np.eye(3), R_true.shape), t_true, R_true, t_true)[0],
+    }
 
 
 def _digest(settings: str, group: Sequence[Pair]) -> str:
@@ -147,11 +158,27 @@ def _run(name: str, method: Method, group: list[Pair], truth: Arrays, warm: set[
     R, t = _poses(name, method, group, truth)
     seconds = (time.perf_counter() - start) / len(group)
     iso_r, iso_t = isotropic_errors(R, t, truth["R_true"], truth["t_true"])
-    closest = [
-        closest_point_error(pair["object"], R[i], t[i], truth["R_true"][i], truth["t_true"][i]) if "object" in pair else np.nan
-        for i, pair in enumerate(group)
-    ]
-    return {"R": R, "t": t, "iso_r_deg": iso_r, "iso_t": iso_t, "closest_point": np.array(closest), "seconds": np.array([seconds])}
+    symmetric = [_up_to_symmetry(pair, R[i], t[i], truth["R_true"][i], truth["t_true"][i]) for i, pair in enumerate(group)]
+    closest, chamfer = np.array(symmetric).T
+    return {
+        "R": R,
+        "t": t,
+        "iso_r_deg": iso_r,
+        "iso_t": iso_t,
+        "closest_point": closest,
+        "chamfer": chamfer,
+        "seconds": np.array([seconds]),
+    }
+
+
+def _up_to_symmetry(pair: Pair, R: ArrayLike, t: ArrayLike, R_true: ArrayLike, t_true: ArrayLike) -> tuple[float, float]:
+    """Return the errors that need the complete object: closest point, Chamfer."""
+    if "object" not in pair:
+        return np.nan, np.nan
+    return (
+        closest_point_error(pair["object"], R, t, R_true, t_true),
+        modified_chamfer(pair["source"], pair["target"], pair["object"], R, t, R_true, t_true),
+    )
 
 
 def _poses(name: str, method: Method, group: list[Pair], truth: Arrays) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
@@ -165,11 +192,9 @@ def _finish(folder: Path, truth: Arrays, done: Mapping[str, Arrays], command: st
     results: dict[str, Any] = {}
     errors = dict(truth)
     for name, found in done.items():
-        closest = found["closest_point"]
-        results[name] = registration_metrics(
-            found["R"], found["t"], truth["R_true"], truth["t_true"], closest_point=None if np.isnan(closest).any() else closest
-        )
-        results[name] |= {"seconds_per_pair": float(np.median(found["seconds"])), "pairs": len(closest)}
+        whole = {key: None if np.isnan(found[key]).any() else found[key] for key in ("closest_point", "chamfer")}
+        results[name] = registration_metrics(found["R"], found["t"], truth["R_true"], truth["t_true"], **whole)
+        results[name] |= {"seconds_per_pair": float(np.median(found["seconds"])), "pairs": len(found["R"])}
         errors |= {f"{name}/{key}": array for key, array in found.items() if key != "seconds"}
     versions = {"python": platform.python_version()} | {package: version(package) for package in PACKAGES}
     results |= {"command": command, "config": dict(config), "versions": versions}

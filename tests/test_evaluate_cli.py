@@ -11,12 +11,13 @@ from cmig_jax.data.pairs import in_categories
 
 METRICS = {"rmse_r_deg", "mae_r_deg", "rmse_t", "mae_t", "iso_r_deg_median", "recall", "closest_point", "seconds_per_pair"}
 METHODS = {"identity", "ICP (cutoff 0.02)", "ICP (tuned)", "CMIGNet"}
+REPORT = ["error_by_category.png", "error_vs_angle.png", "error_vs_overlap.png", "errors.png", "report.html"]
 
 
 @pytest.fixture(scope="module")
 def evaluated(command_line, trained):
     run, _ = trained
-    return run, command_line("evaluate.py", run, "--limit", 4, "--batch", 4)
+    return run, command_line("evaluate.py", run, "--limit", 4, "--batch", 4, "--report", "--report-pairs", 3)
 
 
 @pytest.fixture(scope="module")
@@ -43,7 +44,7 @@ def test_results_name_every_method_and_metric(results):
 
 
 def test_results_hold_what_made_them(results, evaluated, tiny):
-    assert results["command"] == f"python evaluate.py {evaluated[0]} --limit 4 --batch 4"
+    assert results["command"] == f"python evaluate.py {evaluated[0]} --limit 4 --batch 4 --report --report-pairs 3"
     assert results["config"]["data"]["points"] == tiny.data.points
     validated = [json.loads(line) for line in (evaluated[0] / "log.jsonl").read_text().splitlines() if "val_rmse_r_deg" in line]
     best = min(validated, key=lambda line: line["val_rmse_r_deg"])
@@ -54,9 +55,31 @@ def test_the_table_is_printed_and_nothing_is_left_over(evaluated):
     run, finished = evaluated
     assert all(method in finished.stdout for method in METHODS)
     assert f"{run}/evaluation" in finished.stdout
-    assert sorted(path.name for path in (run / "evaluation").iterdir()) == [
-        "curve.png", "errors.npz", "pairs.png", "results.json", "views.png"
-    ]  # fmt: skip
+    assert {path.name for path in (run / "evaluation").iterdir()} == {
+        "curve.png", "errors.npz", "pairs.png", "results.json", "table.md", "table.tex", "views.png", *REPORT
+    }  # fmt: skip
+
+
+def test_the_report_shows_what_was_evaluated(evaluated, results):
+    folder = evaluated[0] / "evaluation"
+    assert f"report: {folder}/report.html" in evaluated[1].stdout
+    page = (folder / "report.html").read_text()
+    assert page.count("<article") == page.count('"matches":{') == 3
+    assert page.count("<canvas") == page.count("<img") == 6
+    assert results["command"] in page
+    assert "4 pairs; 48 points sampled once" in page
+    for text in (page, (folder / "table.md").read_text(), (folder / "table.tex").read_text()):
+        assert all(f"{results[method]['rmse_r_deg']:.2f}" in text for method in METHODS)
+
+
+def test_without_the_flag_there_is_no_report(main, trained):
+    finished = main("evaluate.py", trained[0], "--limit", 1, "--batch", 4, "--out", "plain")
+    assert finished.returncode == 0, finished.stderr
+    assert {path.name for path in (trained[0] / "plain").iterdir()}.isdisjoint(REPORT)
+
+
+def test_a_report_of_no_pair_is_one_line_of_error(main, trained):
+    assert_one_line(main("evaluate.py", trained[0], "--report", "--report-pairs", 0), "report_pairs = 0: expected at least 1 pair")
 
 
 @pytest.mark.parametrize("name", ["pairs", "views", "curve"])
@@ -69,7 +92,7 @@ def test_the_pictures_show_something(evaluated, name):
 def test_help_shows_the_run_s_own_data_flags(main, trained):
     finished = main("evaluate.py", trained[0], "--help")
     assert finished.returncode == 0
-    for flag in ("--which", "--limit", "--batch", "--out", "--data.test-categories", "--data.noise-std"):
+    for flag in ("--which", "--limit", "--batch", "--out", "--report", "--report-pairs", "--data.test-categories", "--data.noise-std"):
         assert flag in finished.stdout
     assert "(default: 48)" in finished.stdout, "the run's number of points, not the schema's"
 
@@ -101,6 +124,6 @@ def test_a_wrong_flag_names_the_nearest(main, trained):
 
 def test_the_halves_of_the_categories_share_no_object():
     labels = np.array([0, 3, 1, 2, 2, 0])
-    first, second = (in_categories(labels, 4, half) for half in ("first-half", "second-half"))
+    first, second = (in_categories(labels, "abcd", half) for half in ("first-half", "second-half"))
     assert first.tolist() == [0, 2, 5]
     assert second.tolist() == [1, 3, 4]

@@ -1,13 +1,22 @@
 """The evaluation loop: what it writes, and that an interruption changes nothing."""
 
 import json
+from dataclasses import replace
 
 import numpy as np
 import pytest
+import trimesh
 from scipy.spatial.transform import Rotation
 
 from cmig_jax.baselines import icp_tuned, identity
+from cmig_jax.data.prepare import prepare
 from cmig_jax.evaluation import ERRORS, METADATA, PARTIAL, RESULTS, evaluate, one_by_one
+from cmig_jax.nn.build import build
+from cmig_jax.report.testing import pairs_to_test
+from cmig_jax.training.checkpoint import Checkpoints, write_config
+from cmig_jax.training.mesh import device_mesh
+from cmig_jax.training.optim import optimizer
+from cmig_jax.training.state import create_state
 
 
 def make_pair(i: int) -> dict[str, np.ndarray]:
@@ -56,6 +65,8 @@ def test_writes_what_it_returns(tmp_path):
     assert list(results) == ["identity", "truth", "command", "config", "versions"]
     assert results["truth"]["rmse_r_deg"] == pytest.approx(0, abs=1e-5)
     assert results["truth"]["recall"] == results["truth"]["recall_closest_point"] == 1
+    assert results["truth"]["chamfer"] == pytest.approx(0, abs=1e-20)
+    assert results["identity"]["chamfer"] > 0.001
     assert results["identity"]["rmse_r_deg"] > 5
     assert results["identity"]["pairs"] == 7
     assert results["identity"]["seconds_per_pair"] > 0
@@ -64,7 +75,10 @@ def test_writes_what_it_returns(tmp_path):
         np.testing.assert_array_equal(errors["index"], range(7))
         np.testing.assert_array_equal(errors["label"], np.arange(7) % 3)
         assert errors["identity/R"].shape == (7, 3, 3)
-        assert np.mean(errors["identity/closest_point"]) == pytest.approx(results["identity"]["closest_point"])
+        for key in ("closest_point", "chamfer"):
+            assert np.mean(errors[f"identity/{key}"]) == pytest.approx(results["identity"][key])
+        np.testing.assert_allclose(errors["angle_deg"], errors["identity/iso_r_deg"])
+        assert np.isnan(errors["overlap"]).all()
 
 
 def test_an_interrupted_run_continues_with_the_same_results(tmp_path):
@@ -99,13 +113,14 @@ def test_a_damaged_chunk_is_computed_again(tmp_path):
     assert evaluate(PAIRS, {"truth": truth}, tmp_path, **SETTINGS)["truth"]["recall"] == 1
 
 
-def test_pairs_without_an_object_have_no_closest_point(tmp_path):
-    pairs = [{key: pair[key] for key in ("source", "target", "R", "t")} for pair in PAIRS]
+def test_pairs_without_an_object_have_no_closest_point_and_may_have_an_overlap(tmp_path):
+    pairs = [{key: pair[key] for key in ("source", "target", "R", "t")} | {"overlap": np.float32(0.5)} for pair in PAIRS]
     results = evaluate(pairs, {"truth": truth}, tmp_path, **SETTINGS)
-    assert "closest_point" not in results["truth"]
+    assert not {"closest_point", "recall_closest_point", "chamfer"} & set(results["truth"])
     with np.load(tmp_path / ERRORS) as errors:
         np.testing.assert_array_equal(errors["index"], range(7))
         assert np.isnan(errors["truth/closest_point"]).all()
+        np.testing.assert_array_equal(errors["overlap"], 0.5)
 
 
 def test_a_broken_pose_names_the_method_and_the_pair(tmp_path):
@@ -133,3 +148,62 @@ def test_bad_input_is_refused(tmp_path, pairs, methods, message):
     with pytest.raises(ValueError, match=message):
         evaluate(pairs, methods, tmp_path, **SETTINGS)
     assert not (tmp_path / RESULTS).exists()
+
+
+def test_excluded_categories_are_not_tested(tiny):
+    config = replace(tiny, data=replace(tiny.data, exclude=("bowl", "lamp")))
+    assert {int(pair["label"]) for pair in pairs_to_test(config)} == {0, 2}
+    with pytest.raises(ValueError, match=r"data\.exclude: vase: expected names of categories, which are bottle, bowl, chair, lamp"):
+        pairs_to_test(replace(tiny, data=replace(tiny.data, exclude=("vase",))))
+    with pytest.raises(ValueError, match=r"data\.test_categories=first-half without data\.exclude=\('bottle', 'bowl'\), found none"):
+        pairs_to_test(replace(tiny, data=replace(tiny.data, test_categories="first-half", exclude=("bottle", "bowl"))))
+
+
+def test_rpmnet_s_protocol_keeps_70_percent_of_independent_samplings(tiny, tmp_path):
+    data = replace(tiny.data, points=30, sampling="twice", crop="half-space", keep=0.7, prepared=str(tmp_path))
+    config = replace(tiny, data=data)
+    prepare(config, tmp_path, workers=1, progress=False)
+    results = evaluate(pairs_to_test(config), {"truth": truth}, tmp_path / "run", **SETTINGS)
+    assert pairs_to_test(config)[0]["source"].shape == (21, 3)
+    assert results["truth"]["iso_r_deg_mean"] == pytest.approx(0, abs=1e-3)
+    assert results["truth"]["chamfer"] == pytest.approx(6 * 0.01**2, rel=0.2)  # the noise of both clouds, in three coordinates
+
+
+@pytest.fixture
+def scans(tmp_path):
+    """Three range scans of a thing, from places 20 degrees apart."""
+    thing, lines = np.random.default_rng(0).normal(size=(400, 3)) * [1, 0.6, 0.3], []
+    for k in range(3):
+        turn = Rotation.from_euler("y", 20 * k, degrees=True)
+        trimesh.PointCloud(thing[50 * k : 300 + 50 * k] @ turn.as_matrix().T).export(tmp_path / f"{k}.ply")
+        lines.append(f"bmesh {k}.ply 0 0 0 {' '.join(map(str, turn.as_quat()))}")
+    (tmp_path / "thing.conf").write_text("\n".join(lines))
+    return tmp_path
+
+
+@pytest.fixture
+def untrained(tiny, tmp_path):
+    """The run folder of a network that has learnt nothing."""
+    run = tmp_path / "untrained"
+    write_config(run, tiny)
+    checkpoints = Checkpoints(run)
+    checkpoints.save(0, create_state(build(tiny), optimizer(tiny.optim, 1), tiny, device_mesh(1, 1)), {}, None)
+    checkpoints.close()
+    return run
+
+
+def test_a_run_is_evaluated_on_recorded_pairs_and_not_trained_on_them(main, untrained, scans, tmp_path):
+    flags = ("--data.source", "stanford-scans", "--data.root", scans, "--data.prepared", tmp_path / "prepared")
+    finished = main("evaluate.py", untrained, *flags, "--limit", 4, "--batch", 4, "--out", "scans")
+    assert finished.returncode == 0, finished.stderr
+    results = json.loads((untrained / "scans" / RESULTS).read_text())
+    assert results["CMIGNet"]["pairs"] == 4
+    assert "chamfer" not in results["identity"]
+    with np.load(untrained / "scans" / ERRORS) as errors:
+        assert set(errors["angle_deg"].round(3)) == {20, 40}
+        np.testing.assert_allclose(errors["angle_deg"], errors["identity/iso_r_deg"])
+        assert (errors["overlap"] > 0.6).all()
+    refused = main("train.py", "quickstart", *flags[:4], "--name", "never", "--runs", tmp_path)
+    assert refused.returncode == 2
+    assert "stanford-scans has recorded pairs, no objects: it is for evaluation only" in refused.stderr
+    assert not (tmp_path / "never").exists()

@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import json
 import math
+import os
 import re
 from collections.abc import Mapping, Sequence
 from pathlib import Path
@@ -66,12 +67,12 @@ def plot_pairs(pairs: Sequence[Mapping[str, Any]], path: Path, *, up: Literal["x
         row, column = divmod(i, columns)
         before, after = grid[2 * row, column], grid[2 * row + 1, column]
         _draw_pair(before, after, pair, up)
-        before.set_title(str(pair.get("title", "")), fontsize=10, color=INK, pad=2)
+        before.set_title(str(pair.get("title", "")), fontsize=10, color=INK, pad=2, parse_math=False)
         if column == 0:
             for axes, label in ((before, "before"), (after, "after")):
                 axes.text2D(-0.02, 0.5, label, transform=axes.transAxes, rotation=90, ha="right", va="center", color=INK, fontsize=10)
     _legend(figure, pairs)
-    _save(figure, path)
+    save(figure, path)
 
 
 def plot_curve(log_path: Path, path: Path) -> None:
@@ -96,7 +97,7 @@ def plot_curve(log_path: Path, path: Path) -> None:
     _draw_losses(panels[0], training)
     if validation:
         _draw_errors(panels[1], validation)
-    _save(figure, path)
+    save(figure, path)
 
 
 def plot_views(views: ArrayLike, path: Path, *, title: str = "") -> None:
@@ -127,7 +128,28 @@ def plot_views(views: ArrayLike, path: Path, *, title: str = "") -> None:
             axes.set_title(f"{i + 1}", fontsize=7, color=FAINT, pad=2)
     if title:
         figure.suptitle(title, fontsize=10, color=INK)
-    _save(figure, path)
+    save(figure, path)
+
+
+def save(figure: Figure, path: Path) -> None:
+    """Write a figure on white, in the format of the path's suffix, under a temporary name first."""
+    FigureCanvasAgg(figure)
+    temporary = path.with_name(f".{path.stem}.{os.getpid()}{path.suffix}")
+    try:
+        figure.savefig(temporary, dpi=DPI, facecolor="white")
+        temporary.replace(path)
+    finally:
+        temporary.unlink(missing_ok=True)
+
+
+def style_axes(axes: Axes, xlabel: str, ylabel: str) -> None:
+    """Name the axes, and leave of their frame and grid what reading needs."""
+    axes.set_xlabel(xlabel, color=INK, fontsize=9)
+    axes.set_ylabel(ylabel, color=INK, fontsize=9)
+    axes.spines[["top", "right"]].set_visible(False)
+    axes.spines[["left", "bottom"]].set_color(FAINT)
+    axes.tick_params(colors=INK, labelsize=8, which="both", color=FAINT)
+    axes.grid(color=FAINT, alpha=0.25, lw=0.6)
 
 
 def _draw_pair(before: Any, after: Any, pair: Mapping[str, Any], up: str) -> None:
@@ -231,15 +253,6 @@ def _draw_errors(axes: Axes, lines: Sequence[Mapping[str, Any]]) -> None:
 
 
 def _finish_panel(axes: Axes, ylabel: str) -> None:
-    axes.set_xlabel("step", color=INK, fontsize=9)
-    axes.set_ylabel(ylabel, color=INK, fontsize=9)
-    axes.spines[["top", "right"]].set_visible(False)
-    axes.spines[["left", "bottom"]].set_color(FAINT)
-    axes.tick_params(colors=INK, labelsize=8, which="both", color=FAINT)
-    axes.grid(axis="y", color=FAINT, alpha=0.25, lw=0.6)
+    style_axes(axes, "step", ylabel)
+    axes.grid(visible=False, axis="x")
     axes.legend(frameon=False, fontsize=8, labelcolor=INK)
-
-
-def _save(figure: Figure, path: Path) -> None:
-    FigureCanvasAgg(figure)
-    figure.savefig(path, dpi=DPI, facecolor="white")

@@ -1,8 +1,9 @@
-"""The results as a table: for the terminal, for Markdown, for LaTeX (the columns of Tables 1 to 4 and ours)."""
+"""The results as a table: for the terminal, for Markdown, for LaTeX, for a page (the columns of Tables 1 to 4 and ours)."""
 
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from html import escape
 from typing import Any, Literal, NamedTuple
 
 from cmig_jax.evaluation import METADATA
@@ -29,6 +30,7 @@ COLUMNS = (
     Column("recall", "recall", "%", 1, 100.0, "high"),
     Column("closest_point", "closest point", "units", 4),
     Column("recall_closest_point", "recall (closest)", "%", 1, 100.0, "high"),
+    Column("chamfer", "Chamfer", "squared units", 5),
     Column("seconds_per_pair", "time", "ms/pair", 1, 1000.0, "none"),
 )
 """Lengths are in units of the normalised object."""
@@ -50,7 +52,7 @@ def text_table(results: Mapping[str, Any], columns: Sequence[Column] = COLUMNS) 
     columns, names, cells = _cells(results, columns)
     rows = [["method", *(c.heading for c in columns)], ["", *(f"[{c.unit}]" for c in columns)]]
     rows += [[name, *(text for text, _ in row)] for name, row in zip(names, cells, strict=True)]
-    lines = _aligned(rows)
+    lines = aligned(rows)
     return "\n".join([*lines[:2], "-" * len(lines[0]), *lines[2:]]) + "\n"
 
 
@@ -61,7 +63,7 @@ def markdown_table(results: Mapping[str, Any], columns: Sequence[Column] = COLUM
     rows += [
         [name.replace("|", r"\|"), *(f"**{text}**" if best else text for text, best in row)] for name, row in zip(names, cells, strict=True)
     ]
-    lines = _aligned(rows, separator=" | ")
+    lines = aligned(rows, separator=" | ")
     widths = [max(len(row[i]) for row in rows) for i in range(len(rows[0]))]
     rule = " | ".join(["-" * widths[0], *("-" * (width - 1) + ":" for width in widths[1:])])
     return "".join(f"| {line} |\n" for line in [lines[0], rule, *lines[1:]])
@@ -70,14 +72,28 @@ def markdown_table(results: Mapping[str, Any], columns: Sequence[Column] = COLUM
 def latex_table(results: Mapping[str, Any], columns: Sequence[Column] = COLUMNS) -> str:
     """Return the table as a LaTeX tabular (package booktabs), the best value of a column in bold. As `text_table` otherwise."""
     columns, names, cells = _cells(results, columns)
-    rows = [["method", *(_latex(c.heading) for c in columns)], ["", *(f"[{_latex(c.unit)}]" for c in columns)]]
+    rows = [["method", *(latex_text(c.heading) for c in columns)], ["", *(f"[{latex_text(c.unit)}]" for c in columns)]]
     rows += [
-        [_latex(name), *(rf"\textbf{{{text}}}" if best else text.replace("–", "--") for text, best in row)]
+        [latex_text(name), *(rf"\textbf{{{text}}}" if best else latex_text(text) for text, best in row)]
         for name, row in zip(names, cells, strict=True)
     ]
-    lines = [rf"{line} \\" for line in _aligned(rows, separator=" & ")]
+    lines = [rf"{line} \\" for line in aligned(rows, separator=" & ")]
     body = [r"\toprule", *lines[:2], r"\midrule", *lines[2:], r"\bottomrule"]
     return "\n".join([rf"\begin{{tabular}}{{l{'r' * len(columns)}}}", *body, r"\end{tabular}"]) + "\n"
+
+
+def html_table(results: Mapping[str, Any], columns: Sequence[Column] = COLUMNS) -> str:
+    """Return the table in HTML, the best value of a column in bold. As `text_table` otherwise."""
+    columns, names, cells = _cells(results, columns)
+    head = "".join(f'<th scope="col">{escape(c.heading)} <small>{escape(c.unit)}</small></th>' for c in columns)
+    rows = [
+        f'<tr><th scope="row">{escape(name)}</th>'
+        + "".join(f"<td><strong>{escape(text)}</strong></td>" if best else f"<td>{escape(text)}</td>" for text, best in row)
+        + "</tr>"
+        for name, row in zip(names, cells, strict=True)
+    ]
+    lines = [f'<thead><tr><th scope="col">method</th>{head}</tr></thead>', "<tbody>", *rows, "</tbody>"]
+    return "\n".join(["<table>", *lines, "</table>"]) + "\n"
 
 
 def _cells(results: Mapping[str, Any], columns: Sequence[Column]) -> tuple[list[Column], list[str], list[list[tuple[str, bool]]]]:
@@ -102,13 +118,15 @@ def _best(column: Column, methods: Mapping[str, Mapping[str, float]]) -> str | N
     return f"{(min if column.best == 'low' else max)(values) * column.factor:.{column.digits}f}"
 
 
-def _aligned(rows: Sequence[Sequence[str]], separator: str = "  ") -> list[str]:
-    """Pad the first column on the right and the others on the left."""
+def aligned(rows: Sequence[Sequence[str]], separator: str = "  ") -> list[str]:
+    """Return one line a row, the first column padded on the right and the others on the left."""
     widths = [max(len(row[i]) for row in rows) for i in range(len(rows[0]))]
     return [
         separator.join([row[0].ljust(widths[0]), *(text.rjust(w) for text, w in zip(row[1:], widths[1:], strict=True))]) for row in rows
     ]
 
 
-def _latex(text: str) -> str:
-    return "".join(f"\\{letter}" if letter in "&%$#_{}" else letter for letter in text)
+def latex_text(text: str) -> str:
+    """Escape what LaTeX reads as a command, and write a dash and a plus-minus sign as LaTeX does."""
+    escaped = "".join(f"\\{letter}" if letter in "&%$#_{}" else letter for letter in text)
+    return escaped.replace("–", "--").replace("±", r"$\pm$")

@@ -1,8 +1,8 @@
-"""The three tables of one result."""
+"""The four tables of one result."""
 
 import pytest
 
-from cmig_jax.report.tables import latex_table, markdown_table, text_table
+from cmig_jax.report.tables import html_table, latex_table, markdown_table, text_table
 
 RESULTS = {
     "identity": {"rmse_r_deg": 26.123, "rmse_t": 0.28961, "recall": 0.0, "seconds_per_pair": 1e-6},
@@ -44,11 +44,20 @@ def test_latex():
     assert text.count(r"\\") == 5
 
 
+def test_html():
+    text = html_table({"a <b>": RESULTS["identity"]} | RESULTS)
+    assert text.count("<tr>") == text.count("</tr>") == 5
+    assert '<th scope="row">a &lt;b&gt;</th>' in text
+    assert '<th scope="col">RMSE(R) <small>deg</small></th>' in text
+    assert "<td><strong>4.50</strong></td>" in text
+    assert text.count("<td>–</td>") == 3
+
+
 def test_a_column_without_a_value_is_left_out():
     assert "closest" not in text_table({"icp_tuned": RESULTS["icp_tuned"]})
 
 
-@pytest.mark.parametrize("table", [text_table, markdown_table, latex_table])
+@pytest.mark.parametrize("table", [text_table, markdown_table, latex_table, html_table])
 def test_no_method_is_an_error(table):
     with pytest.raises(ValueError, match="at least one method"):
         table({"command": "python evaluate.py"})

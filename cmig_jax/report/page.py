@@ -1,0 +1,196 @@
+"""The report of an evaluation as one HTML page: it opens from a folder, without a server, and asks for nothing outside itself.
+
+`page.html` is the frame, `page.css` the looks, `viewer.js` draws pairs, `page.js` ties both to the controls; all are written into the
+page, with the pairs as JSON and the pictures as data. A content security policy in the page forbids every request.
+"""
+
+from __future__ import annotations
+
+import base64
+import json
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from html import escape
+from pathlib import Path
+from string import Template
+from typing import Any
+
+import numpy as np
+
+from cmig_jax.config import Config
+from cmig_jax.data.recordings import SOURCES as RECORDED
+from cmig_jax.metrics import RECALL_CLOSEST_POINT, RECALL_DEG, RECALL_LENGTH
+from cmig_jax.report.errors import Errors
+from cmig_jax.report.figures import Drawn
+from cmig_jax.report.gallery import MAX_POINTS, Example, contact_sheet, describe
+from cmig_jax.report.plots import CORRECT, SOURCE, TARGET, WRONG
+from cmig_jax.report.tables import html_table
+from cmig_jax.training.checkpoint import write_atomically
+
+TRUTH = "#7b6ba8"
+PARTS = Path(__file__).parent
+
+
+@dataclass(frozen=True)
+class Report:
+    """What the page says.
+
+    Attributes:
+        run: name of the run.
+        checkpoint: which one, and its step.
+        config: the run's flags, with the test data's.
+        results: what `evaluate` returned.
+        errors: the same, pair by pair.
+        examples: the pairs to show, in this order.
+        figures: to stand at the end.
+    """
+
+    run: str
+    checkpoint: str
+    config: Config
+    results: Mapping[str, Any]
+    errors: Errors
+    examples: Sequence[Example]
+    figures: Sequence[Drawn]
+
+
+def write_page(path: Path, report: Report) -> None:
+    """Write the page, under a temporary name first."""
+    page = Template(_part("page.html")).substitute(
+        title=escape(f"{report.run}: evaluation"),
+        style=_style(),
+        run=escape(report.run),
+        facts=_facts(report),
+        table=html_table(report.results),
+        reading=escape(_reading(report.config)),
+        methods=_methods(report.errors),
+        pairs_note=escape(_pairs_note(report)),
+        pairs="\n".join(_pair(example, number, report) for number, example in enumerate(report.examples, start=1)),
+        figures="\n".join(_figure(figure) for figure in report.figures),
+        data=_embedded({"network": report.errors.network, "pairs": [describe(e, report.errors) for e in report.examples]}),
+        script=f"{_part('viewer.js')}\n{_part('page.js')}",
+    )
+    write_atomically(path, page)
+
+
+def protocol(config: Config, pairs: int) -> str:
+    """Describe in one line what the pairs are and how they were made."""
+    data, views = config.data, config.views
+    shown = "" if views.shown == "real" else f"; views: {views.shown}"
+    kept = data.points if data.crop == "none" else round(data.points * data.keep)
+    if data.source in RECORDED:
+        return f"{data.source}, {pairs} recorded pairs turned by up to {data.max_angle_deg:g}°, {kept} points per cloud{shown}"
+    categories = f"{data.test_categories} categories" + (f" without {', '.join(data.exclude)}" if data.exclude else "")
+    crop = "no crop" if data.crop == "none" else f"{data.crop} crop to {data.keep:.0%}"
+    noise = f"noise {data.noise_std:g} clipped at {data.noise_clip:g}" if data.noise_std > 0 else "no noise"
+    pose = f"rotations up to {data.max_angle_deg:g}° per axis, translations up to {data.max_translation:g}"
+    return f"{data.source}, {categories}, {pairs} pairs; {data.points} points sampled {data.sampling}, {crop}, {noise}; {pose}{shown}"
+
+
+def _part(name: str) -> str:
+    return (PARTS / name).read_text()
+
+
+def _style() -> str:
+    colours = {"source": SOURCE, "target": TARGET, "right": CORRECT, "wrong": WRONG, "truth": TRUTH}
+    return f":root {{ {' '.join(f'--{name}: {colour};' for name, colour in colours.items())} }}\n{_part('page.css')}"
+
+
+def _facts(report: Report) -> str:
+    versions = ", ".join(f"{package} {version}" for package, version in report.results["versions"].items())
+    facts = {
+        "checkpoint": escape(report.checkpoint),
+        "protocol": escape(protocol(report.config, len(report.errors))),
+        "command": f"<code>{escape(report.results['command'])}</code>",
+        "versions": escape(versions),
+    }
+    return "\n".join(f"<dt>{name}</dt><dd>{value}</dd>" for name, value in facts.items())
+
+
+def _reading(config: Config) -> str:
+    frame = "of the recordings' common scale" if config.data.source in RECORDED else "of the normalised object"
+    return (
+        f"Lengths are in units {frame}. RMSE and MAE compare Euler angles and components of the translation; angle and shift are those "
+        f"of the motion between the found and the true pose. Recall: below {RECALL_DEG:g}° and {RECALL_LENGTH:g}; recall (closest): "
+        f"mean closest-point distance below {RECALL_CLOSEST_POINT:g}, which forgives symmetries. Best values are bold."
+    )
+
+
+def _methods(errors: Errors) -> str:
+    return "".join(
+        f'<option value="{escape(name)}"{" selected" if name == errors.network else ""}>{escape(name)}</option>' for name in errors.methods
+    )
+
+
+def _pairs_note(report: Report) -> str:
+    near = report.config.loss.match_threshold
+    return (
+        f"{len(report.examples)} of {len(report.errors)} pairs, by the rotation error of {report.errors.network}, the largest first. "
+        f"A correspondence is right if it lies within {near:g} under the true pose. Overlap is the share of source points with a target "
+        f"point within {near:g} under the true pose. "
+        f"Coordinates are rounded to 16 bits, clouds thinned to {MAX_POINTS:,} points where they have more."
+    )
+
+
+def _pair(example: Example, number: int, report: Report) -> str:
+    """Write the card of a pair; the script finds its canvases by class."""
+    errors, i = report.errors, example.position
+    title = f"{number}. {errors.category[i] or 'pair'}"
+    facts = (
+        f"{_standing(example.rank, len(errors))} · {example.name} · true angle {errors.angle_deg[i]:.1f}°, "
+        f"shift {np.linalg.norm(errors.t[i]):.2f} · overlap {errors.overlap[i]:.0%}"
+    )
+    panes = "".join(
+        f'<figure><canvas tabindex="0" role="application" aria-roledescription="3D view" aria-label="Pair {number} {when} registration. '
+        f'Arrow keys turn it, plus and minus zoom, 0 resets." data-when="{when}"></canvas><figcaption>{when}</figcaption></figure>'
+        for when in ("before", "after")
+    )
+    return (
+        f'<article class="pair" id="pair-{number}"><header><h3>{escape(title)}</h3><p>{escape(facts)}</p></header>\n'
+        f'<div class="panes">{panes}</div>\n{_errors_of_pair(errors, i)}\n{_views(example, report.config)}</article>'
+    )
+
+
+def _standing(rank: int, count: int) -> str:
+    if rank == count - 1:
+        return f"best of {count}"
+    if rank == (count - 1) // 2:
+        return f"median of {count}"
+    return f"rank {rank + 1} of {count}, worst first" if rank else f"worst of {count}"
+
+
+def _errors_of_pair(errors: Errors, i: int) -> str:
+    rows = "".join(
+        f'<tr data-method="{escape(name)}"><th scope="row">{escape(name)}</th>'
+        f"<td>{found.rotation_deg[i]:.2f}</td><td>{found.shift[i]:.4f}</td></tr>"
+        for name, found in errors.methods.items()
+    )
+    head = '<th scope="col">method</th><th scope="col">angle <small>deg</small></th><th scope="col">shift <small>units</small></th>'
+    return f'<table class="errors"><thead><tr>{head}</tr></thead><tbody>{rows}</tbody></table>'
+
+
+def _views(example: Example, config: Config) -> str:
+    views = example.pair.get("views")
+    if views is None:
+        return ""
+    names = ["source", "target"] if len(views) == 2 else [config.views.of]
+    of_others = {"real": "", "shuffled": ", here of another pair", "zero": ", here black"}[config.views.shown]
+    sheets = []
+    for name, seen in zip(names, views, strict=True):
+        sheet, width = contact_sheet(np.asarray(seen))
+        picture = base64.b64encode(sheet).decode()
+        text = f"{len(seen)} depth views of the {name}{of_others}"
+        image = f'<img width="{width}" src="data:image/png;base64,{picture}" alt="{escape(text)}">'
+        sheets.append(f"<figure>{image}<figcaption>{escape(text)}</figcaption></figure>")
+    return f'<div class="views">{"".join(sheets)}</div>'
+
+
+def _figure(figure: Drawn) -> str:
+    heading = escape(figure.heading)
+    picture = f'<div class="drawing" role="img" aria-label="{heading}">{figure.svg}</div>'
+    return f"<figure><h3>{heading}</h3>{picture}<figcaption>{escape(figure.caption)}</figcaption></figure>"
+
+
+def _embedded(data: Any) -> str:
+    """Write JSON that no script element ends early for: a name may hold anything."""
+    return json.dumps(data, separators=(",", ":")).replace("<", "\\u003c")

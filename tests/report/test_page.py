@@ -1,0 +1,134 @@
+"""The page is one file that asks for nothing, says what it was given, and is not broken by a name."""
+
+import dataclasses
+import json
+from html.parser import HTMLParser
+
+import pytest
+
+from cmig_jax.config import Config, DataConfig
+from cmig_jax.report.figures import write_figures
+from cmig_jax.report.page import protocol, write_page
+
+EMPTY = {"meta", "img", "input"}
+
+
+class Page(HTMLParser):
+    """The elements of a page, their attributes and texts."""
+
+    def __init__(self, text: str) -> None:
+        super().__init__()
+        self.elements: list[tuple[str, dict[str, str | None]]] = []
+        self.texts: list[tuple[str, str]] = []
+        self.open: list[str] = []
+        self.feed(text)
+        self.close()
+
+    def handle_starttag(self, tag, attrs):
+        self.elements.append((tag, dict(attrs)))
+        if tag not in EMPTY:
+            self.open.append(tag)
+
+    def handle_startendtag(self, tag, attrs):
+        self.elements.append((tag, dict(attrs)))
+
+    def handle_endtag(self, tag):
+        assert self.open.pop() == tag, f"{tag} closes another element"
+
+    def handle_data(self, data):
+        self.texts.append((self.open[-1] if self.open else "", data))
+
+    def all(self, tag: str) -> list[dict[str, str | None]]:
+        return [attributes for name, attributes in self.elements if name == tag]
+
+    def text(self, tag: str) -> list[str]:
+        return [text for name, text in self.texts if name == tag]
+
+
+def written(folder, report) -> Page:
+    write_page(folder / "report.html", report)
+    assert [path.name for path in folder.iterdir()] == ["report.html"]
+    page = Page((folder / "report.html").read_text())
+    assert not page.open
+    return page
+
+
+@pytest.fixture(scope="module")
+def page(tmp_path_factory, report):
+    figures = write_figures(tmp_path_factory.mktemp("figures"), report.errors)
+    return written(tmp_path_factory.mktemp("page"), dataclasses.replace(report, figures=figures))
+
+
+def test_it_asks_for_nothing(page):
+    assert not page.all("link")
+    for _, attributes in page.elements:
+        for name in ("src", "href", "xlink:href", "srcset", "action"):
+            assert (attributes.get(name) or "#").startswith(("#", "data:"))
+        assert "http" not in " ".join(value or "" for key, value in attributes.items() if key != "http-equiv")
+    assert all("src" not in attributes for attributes in page.all("script"))
+    assert not any("@import" in text or "http" in text for text in [*page.text("style"), *page.text("script")])
+    policy = next(a["content"] for a in page.all("meta") if a.get("http-equiv") == "Content-Security-Policy")
+    assert policy is not None
+    assert policy.startswith("default-src 'none'; img-src data:;")
+
+
+def test_a_hostile_name_stays_text(page, report, hostile):
+    assert [attributes.get("type") for attributes in page.all("script")] == ["application/json", None]
+    assert all("onerror" not in attributes for _, attributes in page.elements)
+    named = sum(report.errors.category[example.position] == hostile for example in report.examples)
+    assert named >= 1
+    assert sum(hostile in text for text in page.text("h3")) == named
+    assert page.text("h1") == ["a <b>"]
+    assert "python evaluate.py 'runs/a <b>' --report" in page.text("code")
+
+
+def test_the_data_names_every_pair_and_method(page, report):
+    data = json.loads(page.text("script")[0])
+    assert data["network"] == "CMIGNet"
+    assert len(data["pairs"]) == len(report.examples) == len(page.all("article"))
+    assert all(list(pair["poses"]) == list(report.errors.methods) for pair in data["pairs"])
+    assert [option["value"] for option in page.all("option")] == list(report.errors.methods)
+    assert len(page.all("canvas")) == 2 * len(report.examples)
+    assert len(page.all("img")) == 2 * len(report.examples), "the views of both clouds"
+
+
+def test_sections_in_order(page):
+    assert page.text("h2") == ["Results", "Pairs, worst first", "Figures"]
+    assert "best, step 7" in page.text("dd")
+    identity = f"{page_value(page, 'identity'):.2f}"
+    assert identity in page.text("td")
+
+
+def page_value(page, method):
+    return float(page.text("td")[page.text("th").index(method) - page.text("th").index("identity")])
+
+
+def test_without_correspondences_or_views(tmp_path, make_errors, make_example, make_report):
+    errors = make_errors()
+    example = make_example(errors, 0, 0, matched=False)
+    del example.pair["views"]
+    page = written(tmp_path, make_report(errors, [example]))
+    assert not page.all("img")
+    assert "matches" not in json.loads(page.text("script")[0])["pairs"][0]
+
+
+def test_twenty_large_pairs_stay_below_ten_megabytes(tmp_path, make_errors, make_example, make_report):
+    errors = make_errors()
+    examples = [make_example(errors, i, i, points=10_000, views=(2, 20, 224, 224)) for i in range(20)]
+    write_page(tmp_path / "report.html", make_report(errors, examples))
+    assert (tmp_path / "report.html").stat().st_size < 10_000_000
+
+
+@pytest.mark.parametrize(
+    ("data", "said"),
+    [
+        ({}, ["modelnet40-hdf5, all categories, 12 pairs; 1024 points sampled once", "shared crop to 75%", "noise 0.01 clipped at 0.05"]),
+        ({"noise_std": 0.0, "crop": "none", "sampling": "twice"}, ["sampled twice, no crop, no noise"]),
+        ({"exclude": ("cone", "vase"), "max_angle_deg": 60.0}, ["all categories without cone, vase", "up to 60° per axis"]),
+        ({"source": "stanford-scans"}, ["stanford-scans, 12 recorded pairs turned by up to 45°, 768 points per cloud"]),
+    ],
+)
+def test_the_protocol_in_one_line(data, said):
+    line = protocol(dataclasses.replace(Config(), data=DataConfig(**data)), 12)
+    assert all(text in line for text in said)
+    assert "\n" not in line

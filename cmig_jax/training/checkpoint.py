@@ -115,6 +115,16 @@ def write_atomically(path: Path, text: str) -> None:
     temporary.replace(path)
 
 
+def last_step(run: Path) -> int | None:
+    """Return the step of a run's last checkpoint, or None where there is none."""
+    folder = (run / "checkpoints").absolute()
+    if not folder.is_dir():
+        return None
+    with ocp.training.Checkpointer(str(folder)) as checkpointer:
+        latest = checkpointer.latest
+        return None if latest is None else latest.step
+
+
 def load_state(run: Path, like: Any, which: Literal["best", "last"] = "best") -> Any:
     """Load the state of a run, by default the best on validation.
 

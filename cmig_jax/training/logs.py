@@ -54,6 +54,18 @@ class Log:
         self._bar.close()
 
 
+class NoLog:
+    """What the processes beside the first one say: nothing."""
+
+    def advance(self, loss: float) -> None: ...
+    def write(self, step: int, values: Mapping[str, float]) -> None: ...
+    def say(self, text: str) -> None: ...
+    def __enter__(self) -> NoLog:
+        return self
+
+    def __exit__(self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None) -> None: ...
+
+
 def _step(line: str) -> int | None:
     """Read the step of a log line; None for one that was cut off."""
     try:

@@ -24,10 +24,11 @@ from cmig_jax.data.shards import Shards, check_settings
 from cmig_jax.metrics import registration_metrics
 from cmig_jax.nn.build import build, uses_images
 from cmig_jax.training.checkpoint import MEASURE, Checkpoints, check_config, write_config
-from cmig_jax.training.logs import Log
+from cmig_jax.training.logs import Log, NoLog
 from cmig_jax.training.mesh import device_mesh, to_device
 from cmig_jax.training.optim import optimizer, schedule
 from cmig_jax.training.predict import Predictor
+from cmig_jax.training.processes import StopVote, in_turn, is_first
 from cmig_jax.training.state import Step, TrainState, abstract_state, create_state, make_step
 
 LOG_EVERY = 10  # steps
@@ -52,22 +53,29 @@ class TrainingData:
 def train(config: Config, run: Path, *, resume: bool = False, progress: bool = True, devices: int | None = None) -> None:
     """Train, validating and saving a checkpoint every `optim.validate_every` epochs.
 
+    Several processes (`processes.join`) train as one: each makes its share of every batch, the first one writes.
+
     Args:
         config: the run's flags.
-        run: the run folder.
+        run: the run folder, which several processes share.
         resume: continue what is there (or start, if nothing is).
         progress: show a bar.
         devices: how many to use (default: the most that share the batch evenly).
 
     Raises:
         ValueError: bad flags or data, or a folder that holds another run, or this one without `resume`.
-        Interrupted: by Ctrl-C or SIGTERM, after saving the last step.
+        Interrupted: by Ctrl-C or SIGTERM in any process, after saving the last step.
         NonFiniteLoss: the batch is in the run folder.
     """
-    if not resume and (run / "checkpoints").exists():
-        raise ValueError(f"{run} holds a run: add --resume to continue it, or choose another --name")
-    check_config(run, config)
-    _Run(config, run, training_data(config), devices).go(progress)
+
+    def open_data() -> TrainingData:
+        if is_first() and not resume and (run / "checkpoints").exists():
+            raise ValueError(f"{run} holds a run: add --resume to continue it, or choose another --name")
+        if is_first():
+            check_config(run, config)
+        return training_data(config)
+
+    _Run(config, run, in_turn(open_data), devices).go(progress)
 
 
 def training_data(config: Config) -> TrainingData:
@@ -75,9 +83,10 @@ def training_data(config: Config) -> TrainingData:
     folder = ensure_prepared(config)
     check_settings(folder, config)
     objects = Shards(folder, "train")
-    chosen = in_categories(objects.labels, len(objects.categories), config.data.categories)
+    chosen = in_categories(objects.labels, objects.categories, config.data.categories, config.data.exclude)
     if len(chosen) < 2:
-        raise ValueError(f"{folder}: expected at least 2 training objects in data.categories={config.data.categories}, got {len(chosen)}")
+        where = f"data.categories={config.data.categories} without data.exclude={config.data.exclude}"
+        raise ValueError(f"{folder}: expected at least 2 training objects in {where}, got {len(chosen)}")
     train, held = split_validation(chosen, config.data.validation, config.data.test_seed)
     views = uses_images(config)
     return TrainingData(
@@ -93,7 +102,7 @@ class _Run:
         self.mesh: Mesh = device_mesh(config.optim.batch, devices)
         self.batches: BatchIterator = training_batches(data.train, config, process=jax.process_index(), processes=jax.process_count())
         model, rule = build(config), optimizer(config.optim, self.epoch_steps)
-        write_config(folder, config)  # now that flags, data and devices fit each other
+        in_turn(self._write_config)  # now that flags, data and devices fit each other
         self.checkpoints = Checkpoints(folder)
         restored = self.checkpoints.restore_last(abstract_state(model, rule, config, self.mesh))
         if restored is None:
@@ -103,36 +112,45 @@ class _Run:
             self.batches.set_state(restored[1])
         self.step = int(self.state.step)
         self.update: Step = make_step(model, rule, config, self.mesh)
-        self.predictor = Predictor(model, config.optim.batch)
+        self.predictor = Predictor(model, config.optim.batch, self.mesh)
+        self.vote = StopVote(self.mesh)
         self.rate = schedule(config.optim, self.epoch_steps)
         self.pending: tuple[int, dict[str, jax.Array], Pair] | None = None
         self.clock = (time.perf_counter(), self.step)
 
     def go(self, progress: bool) -> None:
-        with _stop_signals() as stop, Log(self.folder, self.step, self.total, progress=progress) as log:
+        log = Log(self.folder, self.step, self.total, progress=progress) if is_first() else NoLog()
+        with _stop_signals() as stop, log:
             try:
                 self._steps(log, stop)
             finally:
                 self.checkpoints.close()
 
-    def _steps(self, log: Log, stop: threading.Event) -> None:
+    def _write_config(self) -> None:
+        if is_first():
+            write_config(self.folder, self.config)
+        elif not (self.folder / "config.json").exists():
+            raise ValueError(f"{self.folder}: expected a folder that all processes share, found no config.json of the first one")
+
+    def _steps(self, log: Log | NoLog, stop: threading.Event) -> None:
         every = self.epoch_steps * self.config.optim.validate_every
         while self.step < self.total:
             arrays = next(self.batches)
             self.state, scalars = self.update(self.state, to_device(arrays, self.mesh))
             self.step += 1
+            stopping = self.vote(stop.is_set())
             # Read a step's numbers only when the next one is under way, so that the device never waits for the host.
             self._settle(log)
             self.pending = (self.step, scalars, arrays)
             at_end = self.step == self.total or self.step % every == 0
-            if at_end or stop.is_set():
+            if at_end or stopping:
                 self._settle(log)
                 self._validate(log) if at_end else self._save(None)
                 self.clock = (time.perf_counter(), self.step)
-            if stop.is_set() and self.step < self.total:
+            if stopping and self.step < self.total:
                 raise Interrupted(f"stopped at step {self.step} of {self.total}; continue with --resume")
 
-    def _settle(self, log: Log) -> None:
+    def _settle(self, log: Log | NoLog) -> None:
         """Check and record the numbers of the last step that was not yet looked at."""
         if self.pending is None:
             return
@@ -150,15 +168,9 @@ class _Run:
     def _position(self, step: int) -> dict[str, float]:
         return {"epoch": step / self.epoch_steps, "learning_rate": float(np.asarray(self.rate(step - 1)))}
 
-    def _validate(self, log: Log) -> None:
-        pairs, batch = self.data.validation, self.config.optim.batch
-        found, true = [], []
-        for start in range(0, len(pairs), batch):
-            chunk = [pairs[i] for i in range(start, min(start + batch, len(pairs)))]
-            found.append(self.predictor(self.state.variables, chunk))
-            true.append((np.stack([pair["R"] for pair in chunk]), np.stack([pair["t"] for pair in chunk])))
-        R, t, R_true, t_true = (np.concatenate(parts) for parts in (*zip(*found, strict=True), *zip(*true, strict=True)))
-        measures = {f"val_{name}": value for name, value in registration_metrics(R, t, R_true, t_true).items()}
+    def _validate(self, log: Log | NoLog) -> None:
+        found, true = self.predictor.beside_truth(self.state.variables, self.data.validation)
+        measures = {f"val_{name}": value for name, value in registration_metrics(*found, *true).items()}
         log.write(self.step, measures | self._position(self.step))
         epoch = self.step // self.epoch_steps
         log.say(f"epoch {epoch}: validation RMSE(R) {measures[MEASURE]:.2f} deg, recall {measures['val_recall']:.2f}")
@@ -170,7 +182,8 @@ class _Run:
     def _check_finite(self, step: int, values: dict[str, float], arrays: Pair) -> None:
         if np.isfinite(list(values.values())).all():
             return
-        path = self.folder / f"not-finite-step-{step}.npz"
+        share = "" if jax.process_count() == 1 else f"-process-{jax.process_index()}"
+        path = self.folder / f"not-finite-step-{step}{share}.npz"
         np.savez(path, **arrays)  # pyright: ignore[reportArgumentType]
         bad = ", ".join(f"{name} = {value}" for name, value in values.items() if not np.isfinite(value))
         raise NonFiniteLoss(f"step {step}: {bad}; the batch is in {path}, the last good state in the checkpoints")

@@ -16,10 +16,10 @@ def device_mesh(batch: int, devices: int | None = None) -> Mesh:
 
     Args:
         batch: pairs per step, over all devices.
-        devices: how many to use; by default the most that divide the batch (on several hosts: all).
+        devices: how many to use; by default the most that divide the batch (of several processes: all).
 
     Raises:
-        ValueError: a batch that does not divide over all devices of several hosts, or more devices than there are.
+        ValueError: a batch that does not divide over all devices of several processes, or more devices than there are.
     """
     available = jax.device_count()
     if devices is None:
@@ -27,8 +27,10 @@ def device_mesh(batch: int, devices: int | None = None) -> Mesh:
     if devices > available or batch % devices:
         raise ValueError(f"{devices} devices: expected a divisor of the batch of {batch} pairs, at most {available}")
     if jax.process_count() > 1 and devices != available:
-        raise ValueError(f"optim.batch = {batch}: expected a multiple of the {available} devices of {jax.process_count()} hosts")
-    return jax.make_mesh((devices,), ("batch",), axis_types=(AxisType.Auto,), devices=jax.devices()[:devices])
+        raise ValueError(f"optim.batch = {batch}: expected a multiple of the {available} devices of {jax.process_count()} processes")
+    # By process, so that each holds a block of consecutive pairs: the share that its loader makes.
+    chosen = sorted(jax.devices(), key=lambda device: (device.process_index, device.id))[:devices]
+    return Mesh(np.array(chosen), ("batch",), axis_types=(AxisType.Auto,))
 
 
 def replicated(mesh: Mesh) -> NamedSharding:

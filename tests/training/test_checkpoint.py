@@ -156,7 +156,7 @@ def test_another_config_is_refused_by_the_flags_that_differ(tmp_path):
     assert differences(Config(), Config()) == []
 
 
-@pytest.mark.parametrize("text", ["", "{", '{"name": "x"}', "[]"])
+@pytest.mark.parametrize("text", ["", "{", '{"nam": "x"}', "[]"])
 def test_a_damaged_config_is_named(tmp_path, text):
     (tmp_path / "config.json").write_text(text)
     with pytest.raises(ValueError, match=f"{tmp_path}/config.json"):

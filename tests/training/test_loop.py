@@ -17,6 +17,7 @@ from cmig_jax.training.mesh import device_mesh
 from cmig_jax.training.optim import optimizer
 from cmig_jax.training.state import abstract_state
 
+pytestmark = pytest.mark.usefixtures("compiled_once")
 TOTAL = 8  # four epochs of two steps
 
 
@@ -24,28 +25,8 @@ class Killed(BaseException):
     """Stands for a process that ends without another word."""
 
 
-@pytest.fixture(scope="module", autouse=True)
-def compiled_once():
-    """Every step is logged, and runs share the compiled step and predictor, which are functions of the config alone."""
-    shared = {}
-
-    def once(make):
-        def made(*arguments):
-            if make not in shared:
-                shared[make] = make(*arguments)
-            return shared[make]
-
-        return made
-
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(loop, "LOG_EVERY", 1)
-        patch.setattr(loop, "make_step", once(loop.make_step))
-        patch.setattr(loop, "Predictor", once(loop.Predictor))
-        yield
-
-
 @pytest.fixture(scope="module")
-def uninterrupted(tiny, tmp_path_factory):
+def uninterrupted(tiny, compiled_once, tmp_path_factory):
     run = tmp_path_factory.mktemp("uninterrupted")
     train(tiny, run, progress=False, devices=1)
     return run

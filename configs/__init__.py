@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable
 
 from cmig_jax.config import Config
-from configs.modelnet40 import corrected, modelnet40_cpu, paper, released
+from configs.modelnet40 import corrected, corrected_cpu, modelnet40_cpu, paper, paper_cpu, released, released_cpu
 from configs.quickstart import quickstart
 
 PRESETS: dict[str, Callable[[], Config]] = {
@@ -14,4 +14,7 @@ PRESETS: dict[str, Callable[[], Config]] = {
     "released": released,
     "corrected": corrected,
     "modelnet40-cpu": modelnet40_cpu,
+    "paper-cpu": paper_cpu,
+    "released-cpu": released_cpu,
+    "corrected-cpu": corrected_cpu,
 }

@@ -10,11 +10,13 @@ from cmig_jax.config import (
     FusionConfig,
     KeypointsConfig,
     LossConfig,
+    MatchingConfig,
     OptimConfig,
     PoseConfig,
     ViewsConfig,
 )
 from configs.quickstart import quickstart
+from configs.scale import at_cpu_scale
 
 
 def paper() -> Config:
@@ -39,13 +41,15 @@ def released() -> Config:
 
 
 def corrected() -> Config:
-    """Ours: observed views as tokens, each cloud's own linear scores, weighted centroids, NT-Xent."""
+    """Ours: observed views as tokens, own linear scores, weighted centroids, NT-Xent; at test all keypoints and more iterations."""
     base = paper()
     return replace(
         base,
         name="corrected",
         views=ViewsConfig(of="both"),
-        model=replace(base.model, fusion=FusionConfig(image="views")),
+        model=replace(
+            base.model, fusion=FusionConfig(image="views"), keypoints=KeypointsConfig(test_count=768), matching=MatchingConfig(repeats=5)
+        ),
         loss=LossConfig(overlap="off", cross_modal="nt-xent", match_mean="positive"),
     )
 
@@ -57,5 +61,21 @@ def modelnet40_cpu() -> Config:
         small,
         name="modelnet40-cpu",
         data=DataConfig(source="modelnet40-hdf5", points=512, categories="first-half", test_categories="second-half"),
+        model=replace(small.model, keypoints=replace(small.model.keypoints, test_count=384)),
         optim=OptimConfig(learning_rate=2e-3, weight_decay=1e-5, schedule="cosine", epochs=24, batch=16, clip_norm=5.0, validate_every=4),
     )
+
+
+def paper_cpu() -> Config:
+    """`paper` at the size that the experiments have on two cores: minutes for a training, for comparisons only."""
+    return replace(at_cpu_scale(paper()), name="paper-cpu")
+
+
+def released_cpu() -> Config:
+    """`released` at that size."""
+    return replace(at_cpu_scale(released()), name="released-cpu")
+
+
+def corrected_cpu() -> Config:
+    """`corrected` at that size."""
+    return replace(at_cpu_scale(corrected()), name="corrected-cpu")

@@ -35,6 +35,6 @@ def small_network() -> ModelConfig:
         points=PointsConfig(k=16, widths=(32, 32, 64, 64), dim=128),
         image=ImageConfig(widths=(16, 32, 64, 128), blocks=(1, 1, 1, 1)),
         fusion=FusionConfig(image="views", feed_forward=256),
-        keypoints=KeypointsConfig(count=64),
-        matching=MatchingConfig(feature_widths=(64, 32, 32)),
+        keypoints=KeypointsConfig(count=64, test_count=192),
+        matching=MatchingConfig(feature_widths=(64, 32, 32), repeats=5),
     )

@@ -52,12 +52,17 @@ def test_a_preset_describes_a_network_that_trains_and_predicts(preset):
     trained, updates = jax.eval_shape(lambda v, b: model.apply(v, b, train=True, key=key, mutable=["batch_stats"]), variables, batch)
     assert jax.tree.structure(updates["batch_stats"]) == jax.tree.structure(variables["batch_stats"])
     predicted = jax.eval_shape(lambda v, b: model.apply(v, b, train=False), variables, batch.replace(target_from_source=None))
-    for prediction in (trained, predicted):
+    m = preset.model
+    sizes = (
+        (m.matching.iterations, m.keypoints.count),
+        (m.matching.iterations + m.matching.repeats, m.keypoints.test_count or m.keypoints.count),
+    )
+    for prediction, (iterations, keypoints) in zip((trained, predicted), sizes, strict=True):
         assert isinstance(prediction, Prediction)
         assert prediction.target_from_source.R.shape == (2, 3, 3)
         assert prediction.target_from_source.t.shape == (2, 3)
-        assert len(prediction.iterations) == preset.model.matching.iterations
-        assert prediction.keypoints.source_index.shape == (2, preset.model.keypoints.count)
+        assert len(prediction.iterations) == iterations
+        assert prediction.keypoints.source_index.shape == (2, keypoints)
         assert (prediction.image_features is not None) == uses_images(preset)
     assert sum(int(np.prod(leaf.shape)) for leaf in jax.tree.leaves(variables["params"])) > 10_000
 
@@ -76,7 +81,14 @@ def test_released_differs_from_paper_in_the_table_s_second_column_alone():
 def test_corrected_sees_what_the_sensor_saw():
     corrected = PRESETS["corrected"]()
     assert (corrected.views.of, corrected.model.fusion.image, corrected.loss.cross_modal) == ("both", "views", "nt-xent")
-    assert corrected.model.keypoints == PRESETS["paper"]().model.keypoints
+    assert dataclasses.replace(corrected.model.keypoints, test_count=0) == PRESETS["paper"]().model.keypoints
+
+
+def test_the_corrected_presets_take_all_points_as_keypoints_at_test():
+    for name in ("corrected", "corrected-cpu", "quickstart", "modelnet40-cpu"):
+        preset = PRESETS[name]()
+        assert preset.model.keypoints.test_count == round(preset.data.points * preset.data.keep)
+        assert preset.model.matching.repeats > 0
 
 
 @pytest.mark.parametrize("name", ["quickstart", "modelnet40-cpu"])

@@ -7,8 +7,22 @@ from pathlib import Path
 import pytest
 
 ROOT = Path(__file__).parents[1]
-TOP = {"registration", "export", "evaluation", "baselines", "parity", "report", "configs", "bench", "train", "evaluate", "cmig_jax"}
+TOP = {
+    "registration",
+    "export",
+    "evaluation",
+    "baselines",
+    "parity",
+    "report",
+    "configs",
+    "bench",
+    "experiments",
+    "train",
+    "evaluate",
+    "cmig_jax",
+}
 BELOW = {
+    "allocator": set(),
     "config": set(),
     "structs": set(),
     "data": {"config"},

@@ -1,0 +1,40 @@
+"""An experiment's rows as a picture: the errors of every seed, and their mean."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+from matplotlib.backends.backend_agg import FigureCanvasAgg
+from matplotlib.figure import Figure
+
+from cmig_jax.experiments.run import Results
+from cmig_jax.experiments.table import spread
+from cmig_jax.report.plots import DPI, FAINT, INK, SOURCE, TARGET
+
+PANELS = (("rmse_r_deg", "RMSE(R), degrees", TARGET), ("mae_r_deg", "MAE(R), degrees", SOURCE))
+
+
+def plot_rows(name: str, results: Results, path: Path) -> None:
+    """Draw RMSE(R) and MAE(R) by row: a dot for each seed, a line at the mean.
+
+    Args:
+        name: of the experiment, for the title.
+        results: at least one outcome has metrics.
+        path: the picture.
+    """
+    labels = list(dict.fromkeys(outcome.job.row.label for outcome in results.outcomes if outcome.metrics))
+    figure = Figure(figsize=(8.5, 1.1 + 0.34 * len(labels)), layout="constrained")
+    FigureCanvasAgg(figure)
+    for axes, (key, heading, colour) in zip(figure.subplots(1, 2, sharey=True), PANELS, strict=True):
+        for height, label in enumerate(labels):
+            values = [o.metrics[key] for o in results.outcomes if o.metrics and o.job.row.label == label]
+            axes.plot(values, [height] * len(values), "o", color=colour, markersize=5, alpha=0.75)
+            axes.vlines(spread(values)[0], height - 0.28, height + 0.28, color=INK, linewidth=1.5)
+        axes.set_xlim(left=0)
+        axes.set_ylim(len(labels) - 0.5, -0.5)
+        axes.set_yticks(range(len(labels)), labels)
+        axes.set_xlabel(heading, color=INK)
+        axes.grid(axis="x", color=FAINT, alpha=0.3)
+        axes.spines[["top", "right"]].set_visible(False)
+    figure.suptitle(name, color=INK, fontsize=11)
+    figure.savefig(path, dpi=DPI)

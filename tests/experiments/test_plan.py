@@ -1,0 +1,102 @@
+"""Experiments as configs: every row is one, and its commands make the same ones."""
+
+import shlex
+from dataclasses import replace
+from pathlib import Path
+
+import pytest
+import tyro
+
+import train
+from cmig_jax.config import Config
+from cmig_jax.experiments.plan import changes, command_line, plan, run_name, with_flags
+from configs import PRESETS
+from configs.experiments import AT_TEST, CORRECTIONS, EXPERIMENTS
+
+ROOTS = dict.fromkeys(("modelnet40-hdf5", "stanford", "stanford-scans", "sevenscenes", "sevenscenes-fragments"), "DIR")
+
+
+def jobs(name, scale="cpu", seeds=(0,)):
+    return plan(EXPERIMENTS[name], scale=scale, roots=ROOTS, source="modelnet40-hdf5", seeds=seeds, runs=Path("runs"))
+
+
+def test_every_table_and_figure_of_the_paper_is_there():
+    assert {f"table{i}" for i in range(1, 9)} | {"figure7", "figure8", "figure9"} <= set(EXPERIMENTS)
+    assert [row.label for row in EXPERIMENTS["table7"].rows] == ["n = 2", "n = 3", "n = 4", "n = 5"]
+    assert [row.quoted.rmse_r_deg for row in EXPERIMENTS["table6"].rows] == [3.565, 3.106, 2.537, 1.708, 1.472]
+
+
+@pytest.mark.parametrize("scale", ["full", "cpu", "toy"])
+@pytest.mark.parametrize("name", EXPERIMENTS)
+def test_every_row_is_a_config_at_every_scale(name, scale):
+    found = jobs(name, scale)
+    assert len(found) == len(EXPERIMENTS[name].rows)
+    for job in found:
+        flags = dict(EXPERIMENTS[name].protocol) | dict(job.row.flags)
+        shrunk = set() if scale == "full" else {"data.points"}
+        assert changes(with_flags(job.training, {f: v for f, v in flags.items() if f not in shrunk}), job.training) == {}
+        assert changes(job.training, job.test).keys() <= set(job.row.test) | {"data.root"}
+
+
+def test_at_full_scale_a_row_changes_what_it_names_and_nothing_else():
+    for name, experiment in EXPERIMENTS.items():
+        for job in jobs(name, "full"):
+            named = set(experiment.protocol) | set(job.row.flags) | {"name", "data.root"}
+            assert changes(PRESETS[job.row.preset](), job.training).keys() <= named
+
+
+@pytest.mark.parametrize("scale", ["full", "cpu"])
+@pytest.mark.parametrize("name", EXPERIMENTS)
+def test_the_printed_command_trains_the_same_config(name, scale):
+    for job in jobs(name, scale, seeds=(3,)):
+        words = shlex.split(job.commands()[0])
+        assert words[:2] == ["python", "train.py"]
+        command = train.parse(words[2:])
+        assert command.config == job.training
+        assert command.runs / command.config.name == job.run
+
+
+def test_rows_share_a_training_exactly_if_they_train_alike():
+    found = [job for name in EXPERIMENTS for job in jobs(name, seeds=(0, 1))]
+    trainings = {}
+    for job in found:
+        alike = with_flags(job.training, {"name": "", "data.test_categories": "all"})
+        assert trainings.setdefault(job.run, alike) == alike
+    assert len(set(map(repr, trainings.values()))) == len(trainings)
+    assert len(trainings) < len(found)
+
+
+def test_no_row_asks_a_recording_for_renders_of_a_complete_object():
+    tests = [job.test for name in EXPERIMENTS for job in jobs(name, "full")]
+    recorded = [test for test in tests if test.data.source in ("stanford-scans", "sevenscenes-fragments")]
+    assert recorded
+    assert {test.views.of for test in recorded} == {"both"}
+
+
+def test_rows_that_are_tested_differently_have_different_results():
+    real, shuffled, zero = (job for job in jobs("images")[:3])
+    assert real.run == shuffled.run == zero.run
+    assert len({real.evaluation, shuffled.evaluation, zero.evaluation}) == 3
+    assert jobs("corrections")[0].evaluation == real.evaluation
+
+
+def test_all_corrections_together_lead_from_released_to_corrected():
+    both = with_flags(PRESETS["released"](), AT_TEST | {flag: v for flags in CORRECTIONS.values() for flag, v in flags.items()})
+    # What is left has no effect on a network without the overlap loss.
+    assert changes(replace(both, name="corrected"), PRESETS["corrected"]()).keys() <= {"loss.overlap_mean"}
+
+
+def test_a_flag_that_is_none_is_an_error():
+    for flag in ("model.matching.iteration", "model.matching", "speed", "data.points.k"):
+        with pytest.raises(ValueError, match="expected the name of a flag"):
+            with_flags(Config(), {flag: 3})
+    with pytest.raises(ValueError, match=r"config\.views\.of = 'all': expected one of"):
+        with_flags(Config(), {"views.of": "all"})
+
+
+def test_names_and_command_lines():
+    flags = {"model.keypoints.score_from": "other", "data.exclude": ("cup", "vase")}
+    assert run_name("paper", flags, 2) == "paper+data.exclude=cup,vase+model.keypoints.score_from=other+seed=2"
+    assert list(command_line(flags)) == ["--model.keypoints.score-from", "other", "--data.exclude", "cup", "vase"]
+    parsed = tyro.cli(Config, args=list(command_line(flags)), config=(tyro.conf.ConsolidateSubcommandArgs,))
+    assert changes(Config(), parsed) == flags

@@ -1,0 +1,101 @@
+"""Experiments from their command to their table, at toy size. `test_plan.py` has every row as a config; here a table, and one of recorded
+pairs, are run, since every row that trains differently costs a compilation: `run all --scale toy` runs all of them, by hand."""
+
+import json
+import shutil
+
+import h5py
+import numpy as np
+import pytest
+
+from cmig_jax.data.pairs import SYMMETRIC
+from cmig_jax.experiments.__main__ import main
+from configs.experiments import EXPERIMENTS
+
+CATEGORIES = (*SYMMETRIC, "chair", "desk", "door", "sofa")
+
+
+@pytest.fixture(scope="session")
+def objects(tmp_path_factory):
+    """A ModelNet40 folder with its symmetric categories and four others, 4 objects each to train on and 1 to test on."""
+    root, rng = tmp_path_factory.mktemp("objects"), np.random.default_rng(0)
+    (root / "shape_names.txt").write_text("\n".join(CATEGORIES) + "\n")
+    for split, each in (("train", 4), ("test", 1)):
+        labels = np.repeat(np.arange(len(CATEGORIES)), each)
+        points = rng.normal(size=(len(labels), 96, 3)) * rng.uniform(0.3, 1, (len(labels), 1, 3))
+        points /= np.linalg.norm(points, axis=-1).max(axis=1)[:, None, None]
+        with h5py.File(root / f"ply_data_{split}0.h5", "w") as file:
+            file["data"], file["label"] = points.astype(np.float32), labels[:, None].astype(np.uint8)
+    return root
+
+
+@pytest.fixture
+def run(objects, scans, scenes, tmp_path, monkeypatch):
+    """Run experiments with their data in a folder of the test's own."""
+    monkeypatch.chdir(tmp_path)  # prepared data goes to data/
+
+    def call(*arguments):
+        places = ("--data", objects, "--stanford", scans, "--sevenscenes", scenes, "--runs", tmp_path / "runs")
+        return main(["run", *map(str, arguments), "--scale", "toy", *map(str, places)])
+
+    return call
+
+
+@pytest.mark.parametrize("name", ["table8", "scans"])
+def test_an_experiment_runs_from_end_to_end(name, run, tmp_path, capsys):
+    assert run(name, "--limit", 4) == 0, capsys.readouterr().out
+    results = json.loads((tmp_path / "runs" / "toy" / f"{name}.json").read_text())
+    assert [row["label"] for row in results["rows"]] == [row.label for row in EXPERIMENTS[name].rows]
+    for row in results["rows"]:
+        (outcome,) = row["runs"]
+        assert outcome["problem"] == ""
+        assert np.isfinite(outcome["metrics"]["rmse_r_deg"])
+        assert outcome["metrics"]["pairs"] <= 4
+    assert bool(results["baselines"]) == EXPERIMENTS[name].baselines
+    for suffix in ("txt", "md", "tex", "png"):
+        assert (tmp_path / "runs" / "toy" / f"{name}.{suffix}").stat().st_size > 0
+
+
+def test_what_is_finished_is_not_done_again_and_what_is_missing_is(run, tmp_path, capsys):
+    assert run("table8", "--limit", 3) == 0
+    folder = tmp_path / "runs" / "toy"
+    logs = {path: path.read_bytes() for path in folder.glob("*/log.jsonl")}
+    first = json.loads((folder / "table8.json").read_text())
+    lost = next(path.parent for path in logs if "pcrnet" in str(path))
+    shutil.rmtree(lost)
+    assert run("table8", "--limit", 3) == 0
+    again = json.loads((folder / "table8.json").read_text())
+    for before, after in zip(first["rows"], again["rows"], strict=True):
+        expected, found = before["runs"][0]["metrics"], after["runs"][0]["metrics"]
+        timed = "PCRNet" in before["label"]
+        assert {k: v for k, v in found.items() if not timed or k != "seconds_per_pair"} == {
+            k: v for k, v in expected.items() if not timed or k != "seconds_per_pair"
+        }
+    for path, text in logs.items():
+        assert path.exists()
+        assert path.parent == lost or path.read_bytes() == text
+    capsys.readouterr()
+    assert run("table8", "--limit", 3, "--only-collect") == 0
+    assert "not run" not in capsys.readouterr().out
+    assert json.loads((folder / "table8.json").read_text())["rows"] == again["rows"]
+
+
+def test_data_that_is_not_given_leaves_a_row_empty_and_a_failure_is_shown(tmp_path, objects, monkeypatch, capsys):
+    monkeypatch.chdir(tmp_path)
+    places = ["--scale", "toy", "--runs", str(tmp_path / "runs")]
+    assert main(["run", "table5", "--data", str(objects), *places]) == 0
+    assert "not run: no folder of sevenscenes data was given" in capsys.readouterr().out
+    assert main(["run", "table8", "--data", str(tmp_path / "nothing"), *places]) == 1
+    printed = capsys.readouterr().out
+    assert "failed: " in printed
+    assert str(tmp_path / "nothing") in printed
+    assert all(word in (tmp_path / "runs" / "toy" / "table8.txt").read_text() for word in ("PCRNet", "0, 1 failed"))
+
+
+def test_an_unknown_experiment_is_an_error_and_the_list_has_all(capsys):
+    assert main(["run", "table9"]) == 2
+    assert "table9" in capsys.readouterr().err
+    assert main(["list"]) == 0
+    printed = capsys.readouterr().out
+    assert all(f"{name}: {experiment.about}" in printed for name, experiment in EXPERIMENTS.items())
+    assert "model.matching.iterations=5" in printed

@@ -74,7 +74,10 @@ def prepare(config: Config, out: str | Path, *, workers: int | None = None, prog
     Raises:
         ValueError: raw data that cannot be read, or a folder that was prepared with other settings.
         OSError: too little space, naming the folder, the bytes needed and the bytes free. Nothing is left half-written.
+            Or a worker that ended early, as in a script that calls this without `if __name__ == "__main__":`.
     """
+    if getattr(multiprocessing.current_process(), "_inheriting", False):  # a worker that imports the script; it would wait for its parent
+        raise RuntimeError("a script that prepares data needs `if __name__ == '__main__':`, since its workers import it")
     out = Path(out)
     settings = settings_of(config)
     raw = open_raw(config.data)

@@ -6,6 +6,8 @@ import json
 import pickle
 import shlex
 import shutil
+import subprocess
+import sys
 from pathlib import Path
 
 import h5py
@@ -110,6 +112,21 @@ def test_shards_travel_to_other_processes(finished):
 
 def test_the_number_of_workers_does_not_matter(config, finished, tmp_path):
     assert contents(prepare(config, tmp_path / "two", workers=2, progress=False)) == contents(finished)
+
+
+def test_a_script_that_its_workers_import_is_told_so_instead_of_waiting_for_ever(meshes, tmp_path):
+    script = tmp_path / "script.py"
+    script.write_text(
+        "from cmig_jax.config import Config, DataConfig\n"
+        "from cmig_jax.data import prepare\n"
+        "prepare.OBJECTS_PER_SHARD = 4\n"
+        f"data = DataConfig(source='meshes', root={str(meshes)!r})\n"
+        "prepare.prepare(Config(data=data), 'prepared', workers=2, progress=False)\n"
+    )
+    done = subprocess.run([sys.executable, script], cwd=tmp_path, capture_output=True, text=True, timeout=120, check=False)
+    assert done.returncode == 1
+    assert "OSError: a process that prepared prepared has ended early" in done.stderr
+    assert "if __name__ == '__main__':" in done.stderr
 
 
 def test_without_views_of_the_object_the_points_are_the_same(config, finished, tmp_path):

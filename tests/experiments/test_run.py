@@ -1,5 +1,5 @@
-"""Experiments from their command to their table, at toy size. `test_plan.py` has every row as a config; here a table, and one of recorded
-pairs, are run, since every row that trains differently costs a compilation: `run all --scale toy` runs all of them, by hand."""
+"""Experiments from their command to their table, at toy size. A table and one of recorded pairs are run each time; the others, a
+compilation or two for each row, by `pytest -m slow tests/experiments`. `test_plan.py` has every row as a config and a training step."""
 
 import json
 import shutil
@@ -41,7 +41,10 @@ def run(objects, scans, scenes, tmp_path, monkeypatch):
     return call
 
 
-@pytest.mark.parametrize("name", ["table8", "scans"])
+QUICK = ("table8", "scans")
+
+
+@pytest.mark.parametrize("name", [*QUICK, *(pytest.param(name, marks=pytest.mark.slow) for name in EXPERIMENTS if name not in QUICK)])
 def test_an_experiment_runs_from_end_to_end(name, run, tmp_path, capsys):
     assert run(name, "--limit", 4) == 0, capsys.readouterr().out
     results = json.loads((tmp_path / "runs" / "toy" / f"{name}.json").read_text())

@@ -1,0 +1,61 @@
+"""Every row's training step and prediction, traced at toy size: shapes and flags fit each other before hours are spent on them."""
+
+from pathlib import Path
+
+import jax
+import pytest
+
+from cmig_jax.experiments.plan import plan, run_name, with_flags
+from cmig_jax.nn.build import build
+from cmig_jax.training.mesh import device_mesh
+from cmig_jax.training.optim import optimizer
+from cmig_jax.training.state import abstract_state, make_step, smallest_batch
+from configs.experiments import EXPERIMENTS
+
+COMPUTED_ALIKE = ("data.", "views.shown")
+"""Flags that change what a network is shown, not what it computes."""
+
+
+def distinct(*, tested):
+    """List one job for each thing to compute, in training or test, named by what it changes."""
+    found = {}
+    for experiment in EXPERIMENTS.values():
+        for job in plan(experiment, scale="toy", roots={}, source="shapes", seeds=(0,), runs=Path("runs")):
+            flags = {**job.row.flags, **(job.row.test if tested else {})}
+            named = {flag: value for flag, value in flags.items() if not flag.startswith(COMPUTED_ALIKE)}
+            found.setdefault(run_name(job.row.preset, named, 0), job)
+    return found
+
+
+TRAININGS, TESTS = distinct(tested=False), distinct(tested=True)
+
+
+def described(config):
+    """Describe the mesh, the state and the smallest batch of a training."""
+    mesh, rule = device_mesh(1), optimizer(config.optim, 1)
+    return mesh, rule, abstract_state(build(config), rule, config, mesh), jax.eval_shape(lambda: smallest_batch(config))
+
+
+def test_all_presets_and_heads_are_among_them():
+    assert {name.split("+")[0] for name in TRAININGS} == {"paper", "released", "corrected"}
+    assert any("pcrnet" in name for name in TRAININGS)
+    assert len(TESTS) > len(TRAININGS) > 20
+
+
+@pytest.mark.parametrize("name", TRAININGS)
+def test_a_row_trains(name):
+    config = TRAININGS[name].training
+    mesh, rule, state, batch = described(config)
+    after, scalars = jax.eval_shape(make_step(build(config), rule, config, mesh), state, batch)
+    assert jax.tree.map(lambda x: (x.shape, x.dtype), after) == jax.tree.map(lambda x: (x.shape, x.dtype), state)
+    assert {"loss", "gradient_norm"} < scalars.keys()
+
+
+@pytest.mark.parametrize("name", TESTS)
+def test_a_row_predicts(name):
+    job = TESTS[name]
+    *_, state, _ = described(job.training)
+    shown = with_flags(job.test, {"model.keypoints.test_count": 0})  # the smallest batch has no more points than that
+    batch = jax.eval_shape(lambda: smallest_batch(shown)).replace(target_from_source=None)
+    predicted = jax.eval_shape(lambda v, b: build(shown).apply(v, b, train=False), state.variables, batch)
+    assert len(predicted.iterations) == job.test.model.matching.iterations + job.test.model.matching.repeats

@@ -8,6 +8,7 @@ from typing import TypeVar
 import jax
 import jax.numpy as jnp
 from jax import Array
+from jax.sharding import PartitionSpec
 
 HIGHEST = jax.lax.Precision.HIGHEST
 T = TypeVar("T")
@@ -38,10 +39,25 @@ def knn(points: Array, k: int, rows: int = 0) -> Array:
     def block(query: Array) -> Array:
         square = squared_distances(query, points)
         # In two axes: XLA's CPU compiler merges slices of the result into a top-k of more axes and then sorts whole rows.
-        index = jax.lax.top_k(-square.reshape(-1, square.shape[-1]), k)[1]
-        return index.reshape(*square.shape[:-1], k)
+        return top_k(-square.reshape(-1, square.shape[-1]), k).reshape(*square.shape[:-1], k)
 
     return map_rows(block, points, rows)
+
+
+def top_k(x: Array, k: int) -> Array:
+    """Return the indices `[B, k]` of the k largest of each row of `x [B, N]`, largest first.
+
+    Under the mesh of several devices (`jax.sharding.use_abstract_mesh`) each sorts its own rows; XLA by itself gathers all rows on all.
+    """
+    mesh = jax.sharding.get_abstract_mesh()
+
+    def own_rows(x: Array) -> Array:
+        return jax.lax.top_k(x, k)[1]
+
+    if mesh.size == 1 or mesh.empty:
+        return own_rows(x)
+    rows = PartitionSpec(mesh.axis_names)
+    return jax.shard_map(own_rows, mesh=mesh, in_specs=rows, out_specs=rows)(x)
 
 
 def nearest(query: Array, points: Array, rows: int = 0) -> tuple[Array, Array]:

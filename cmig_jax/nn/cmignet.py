@@ -112,9 +112,11 @@ class CMIGNet(nn.Module):
         if source.shape[1] != target.shape[1]:
             source, target = self.points((source, target), train=train)
             return source, target
-        (both,) = self.points((jnp.concatenate([source, target]),), train=train)
-        source, target = jnp.split(both, 2)
-        return source, target
+        # Pair by pair, so that each of several devices keeps its own pairs.
+        both = jnp.stack([source, target], axis=1)
+        (both_features,) = self.points((both.reshape(-1, *source.shape[1:]),), train=train)
+        features = both_features.reshape(*both.shape[:-1], -1)
+        return features[:, 0], features[:, 1]
 
     def _view_tokens(self, batch: Batch, train: bool) -> Array | None:
         """Encode the views to `[B, S, V, C]`; skipped in evaluation where only a loss reads them."""

@@ -9,7 +9,7 @@ import jax
 import jax.numpy as jnp
 from jax import Array
 
-from cmig_jax.geometry.neighbors import nearest
+from cmig_jax.geometry.neighbors import nearest, top_k
 from cmig_jax.nn.mlp import MLP, torch_kernel
 from cmig_jax.nn.norm import channels
 from cmig_jax.structs import Keypoints, RigidTransform
@@ -39,7 +39,7 @@ class SignificanceScore(nn.Module):
 
 def top_scores(scores: Array, count: int) -> Array:
     """Return the indices `[B, count]` of the highest scores `[B, N]`."""
-    return jax.lax.top_k(scores, count)[1]
+    return top_k(scores, count)
 
 
 def random_points(key: Array, clouds: int, points: int, count: int) -> Array:
@@ -63,7 +63,7 @@ def draw_for_training(key: Array, label: Array, count: int) -> Array:
     """
     keys = jax.random.split(key)
     halves = [(keys[0], label, count // 2), (keys[1], 1 - label, count - count // 2)]
-    drawn = [jax.lax.top_k(jnp.log(p + 1e-5) + jax.random.gumbel(k, p.shape, p.dtype), n)[1] for k, p, n in halves]
+    drawn = [top_k(jnp.log(p + 1e-5) + jax.random.gumbel(k, p.shape, p.dtype), n) for k, p, n in halves]
     return jnp.concatenate(drawn, axis=-1)
 
 

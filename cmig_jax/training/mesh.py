@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager, nullcontext
 
 import jax
 import numpy as np
@@ -41,6 +42,13 @@ def replicated(mesh: Mesh) -> NamedSharding:
 def split(mesh: Mesh) -> NamedSharding:
     """Return the sharding of a batch: its first axis over the devices."""
     return NamedSharding(mesh, PartitionSpec("batch"))
+
+
+@contextmanager
+def sharing(mesh: Mesh | None) -> Iterator[None]:
+    """Let what is traced inside know that the devices of a mesh share the batch (`geometry.neighbors.top_k`)."""
+    with nullcontext() if mesh is None else jax.sharding.use_abstract_mesh(mesh.abstract_mesh):
+        yield
 
 
 def to_device(arrays: Mapping[str, np.ndarray], mesh: Mesh | None = None) -> Batch:

@@ -13,7 +13,7 @@ from cmig_jax.data.loader import stack
 from cmig_jax.data.pairs import Pair
 from cmig_jax.nn.cmignet import CMIGNet
 from cmig_jax.structs import Batch, Prediction, RigidTransform
-from cmig_jax.training.mesh import replicated, split, to_device
+from cmig_jax.training.mesh import replicated, sharing, split, to_device
 
 Poses = tuple[np.ndarray, np.ndarray]
 
@@ -37,7 +37,8 @@ class Predictor:
             return prediction
 
         def poses(variables: Mapping[str, Any], inputs: Batch) -> tuple[RigidTransform, RigidTransform | None]:
-            return apply(variables, inputs).target_from_source, inputs.target_from_source
+            with sharing(mesh):
+                return apply(variables, inputs).target_from_source, inputs.target_from_source
 
         self.apply = jax.jit(apply)
         shardings: dict[str, Any] = {}

@@ -16,7 +16,7 @@ from cmig_jax.config import Config
 from cmig_jax.losses import losses
 from cmig_jax.nn.cmignet import CMIGNet
 from cmig_jax.structs import Batch, Prediction, RigidTransform
-from cmig_jax.training.mesh import replicated, split
+from cmig_jax.training.mesh import replicated, sharing, split
 
 Step = Callable[["TrainState", Batch], tuple["TrainState", dict[str, Array]]]
 
@@ -91,7 +91,8 @@ def make_step(model: CMIGNet, optimizer: optax.GradientTransformation, config: C
 
     def step(state: TrainState, batch: Batch) -> tuple[TrainState, dict[str, Array]]:
         key = jax.random.fold_in(jax.random.key(config.seed), state.step)
-        (loss, (terms, batch_stats)), gradient = jax.value_and_grad(loss_function, has_aux=True)(state.params, state, batch, key)
+        with sharing(mesh):
+            (loss, (terms, batch_stats)), gradient = jax.value_and_grad(loss_function, has_aux=True)(state.params, state, batch, key)
         norm = optax.tree.norm(gradient)
         updates, opt_state = optimizer.update(gradient, state.opt_state, state.params)
         changed = TrainState(

@@ -1,5 +1,7 @@
 """The training step: the same on any number of devices, compiled once, safe against bad numbers."""
 
+import re
+
 import jax
 import numpy as np
 import pytest
@@ -73,6 +75,8 @@ def test_eight_devices_equal_one(tiny, parts, initial, batches):
     # Compiled with few optimisations, in half the time.
     lowered = make_step(model, rule, tiny, eight).lower(placed(initial, eight), to_device(batches[0], eight))
     step_of_eight = lowered.compile({"xla_backend_optimization_level": 0})
+    of_one_pair = 4 * batches[0]["source"][0].shape[0] ** 2  # a matrix over its points
+    assert max(moved_between_devices(step_of_eight.as_text())) < of_one_pair, "a device needs the sums of others, not their pairs"
     one_first, one_scalars = run(step, placed(initial, mesh), batches[:1], mesh)
     all_first, all_scalars = run(step_of_eight, placed(initial, eight), batches[:1], eight)
     one_state, one_second = run(step, placed(one_first, mesh), batches[1:], mesh)
@@ -94,6 +98,13 @@ def test_eight_devices_equal_one(tiny, parts, initial, batches):
     assert np.mean(apart > 0.1 * rate) < 0.05
     assert np.median(moved) > 0.5 * rate, "two steps must move the parameters for this to say anything"
     assert all_second[0]["loss"] == pytest.approx(one_second[0]["loss"], rel=1e-2)
+
+
+def moved_between_devices(program):
+    """List the bytes of what a compiled program gathers or redistributes (sums over the devices, which it needs, aside)."""
+    moves = re.findall(r"= (.*?) (?:all-gather|all-to-all|collective-permute)(?:-start)?\(", program)
+    sizes = [[int(n) for n in shape.split(",") if n] for move in moves for shape in re.findall(r"[fsu]32\[([\d,]*)\]", move)]
+    return [4 * int(np.prod(size)) for size in sizes]
 
 
 def flat(tree):

@@ -11,6 +11,7 @@ from typing import Annotated, Literal
 
 import tyro
 
+from cmig_jax.compilation import keep_compiled_programs
 from cmig_jax.config import ComputeConfig, Config, DataConfig, ModelConfig, ViewsConfig
 from cmig_jax.report.testing import evaluate_run
 from cmig_jax.training.checkpoint import read_config
@@ -85,4 +86,5 @@ def _command(run: Path, config: Config) -> Command:
 
 
 if __name__ == "__main__":
+    keep_compiled_programs()
     raise SystemExit(main())

@@ -10,6 +10,7 @@ from typing import Annotated
 import tyro
 
 from cmig_jax.allocator import keep_freed_memory
+from cmig_jax.compilation import keep_compiled_programs
 from cmig_jax.config import Config
 from cmig_jax.training.loop import Interrupted, NonFiniteLoss, train
 from cmig_jax.training.processes import is_first, join
@@ -82,4 +83,5 @@ def _say(text: str) -> None:
 
 if __name__ == "__main__":
     keep_freed_memory()
+    keep_compiled_programs()
     raise SystemExit(main())

@@ -23,6 +23,7 @@ TOP = {
 }
 BELOW = {
     "allocator": set(),
+    "compilation": set(),
     "config": set(),
     "structs": set(),
     "data": {"config"},

@@ -11,6 +11,7 @@ from typing import Annotated, Literal
 import tyro
 
 from cmig_jax.allocator import keep_freed_memory
+from cmig_jax.compilation import keep_compiled_programs
 from cmig_jax.experiments.figure import plot_rows
 from cmig_jax.experiments.plan import Job, Scale, plan
 from cmig_jax.experiments.run import Results, collect, run
@@ -130,4 +131,5 @@ def write(folder: Path, name: str, results: Results) -> None:
 
 if __name__ == "__main__":
     keep_freed_memory()
+    keep_compiled_programs()
     raise SystemExit(main())

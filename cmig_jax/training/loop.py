@@ -112,6 +112,7 @@ class _Run:
             self.batches.set_state(restored[1])
         self.step = int(self.state.step)
         self.update: Step = make_step(model, rule, config, self.mesh)
+        self.key = jax.random.key(config.seed)
         self.predictor = Predictor(model, config.optim.batch, self.mesh)
         self.vote = StopVote(self.mesh)
         self.rate = schedule(config.optim, self.epoch_steps)
@@ -136,7 +137,7 @@ class _Run:
         every = self.epoch_steps * self.config.optim.validate_every
         while self.step < self.total:
             arrays = next(self.batches)
-            self.state, scalars = self.update(self.state, to_device(arrays, self.mesh))
+            self.state, scalars = self.update(self.state, to_device(arrays, self.mesh), self.key)
             self.step += 1
             stopping = self.vote(stop.is_set())
             # Read a step's numbers only when the next one is under way, so that the device never waits for the host.

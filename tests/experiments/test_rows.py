@@ -46,7 +46,7 @@ def test_all_presets_and_heads_are_among_them():
 def test_a_row_trains(name):
     config = TRAININGS[name].training
     mesh, rule, state, batch = described(config)
-    after, scalars = jax.eval_shape(make_step(build(config), rule, config, mesh), state, batch)
+    after, scalars = jax.eval_shape(make_step(build(config), rule, config, mesh), state, batch, jax.random.key(0))
     assert jax.tree.map(lambda x: (x.shape, x.dtype), after) == jax.tree.map(lambda x: (x.shape, x.dtype), state)
     assert {"loss", "gradient_norm"} < scalars.keys()
 

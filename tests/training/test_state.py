@@ -13,6 +13,7 @@ from cmig_jax.training.mesh import device_mesh, replicated, to_device
 from cmig_jax.training.optim import optimizer
 from cmig_jax.training.state import abstract_state, create_state, make_step
 
+KEY = jax.random.key(0)
 BATCH = 8
 
 
@@ -48,7 +49,7 @@ def placed(state, mesh):
 def run(step, state, batches, mesh):
     scalars = []
     for batch in batches:
-        state, found = step(state, to_device(batch, mesh))
+        state, found = step(state, to_device(batch, mesh), KEY)
         scalars.append({name: float(value) for name, value in found.items()})
     return jax.tree.map(np.array, state), scalars
 
@@ -73,7 +74,7 @@ def test_eight_devices_equal_one(tiny, parts, initial, batches):
     eight = device_mesh(BATCH, 8)
     assert len(jax.devices()) == eight.size == 8
     # Compiled with few optimisations, in half the time.
-    lowered = make_step(model, rule, tiny, eight).lower(placed(initial, eight), to_device(batches[0], eight))
+    lowered = make_step(model, rule, tiny, eight).lower(placed(initial, eight), to_device(batches[0], eight), KEY)
     step_of_eight = lowered.compile({"xla_backend_optimization_level": 0})
     of_one_pair = 4 * batches[0]["source"][0].shape[0] ** 2  # a matrix over its points
     assert max(moved_between_devices(step_of_eight.as_text())) < of_one_pair, "a device needs the sums of others, not their pairs"
@@ -114,10 +115,10 @@ def flat(tree):
 def test_steps_trace_once_and_donate_the_state(parts, state, batches):
     _, _, mesh, step = parts
     donated = jax.tree.leaves(state.params)
-    state, _ = step(state, to_device(batches[0], mesh))
+    state, _ = step(state, to_device(batches[0], mesh), KEY)
     traces = step._cache_size()
     for batch in batches * 2:
-        state, _ = step(state, to_device(batch, mesh))
+        state, _ = step(state, to_device(batch, mesh), KEY)
     assert step._cache_size() == traces == 1
     assert int(state.step) == 5
     assert all(leaf.is_deleted() for leaf in donated)

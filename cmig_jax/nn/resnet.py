@@ -7,17 +7,20 @@ response to the constant image `mean_c / std_c`, which is computed once. The sam
 
 from __future__ import annotations
 
+from collections.abc import Callable
+from typing import Any
+
 import flax.linen as nn
 import jax
 import jax.numpy as jnp
 from jax import Array
 
+from cmig_jax.nn.convolution import CONVOLVED, Convolution, convolve, he_fan_out
 from cmig_jax.nn.norm import BatchNorm
 from cmig_jax.nn.pooling import max_pool
 
 IMAGENET_MEAN = (0.485, 0.456, 0.406)
 IMAGENET_STD = (0.229, 0.224, 0.225)
-he_fan_out = nn.initializers.variance_scaling(2.0, "fan_out", "normal")
 
 
 class ViewEncoder(nn.Module):
@@ -31,14 +34,19 @@ class ViewEncoder(nn.Module):
     def __call__(self, views: Array, *, train: bool) -> Array:
         """Encode views `[..., H, W, 1]` (uint8 depth) or `[..., H, W, 3]` (normalised RGB) to `[..., widths[-1]]`."""
         x = Stem(self.widths[0], dtype=self.dtype, name="stem")(views.reshape(-1, *views.shape[-3:]))
-        x = nn.relu(BatchNorm(self.widths[0], name="stem_norm")(x, train=train))
-        x = max_pool(x)
+        x = sparing(lambda norm, x: max_pool(nn.relu(norm(x, train=train))), BatchNorm(self.widths[0], name="stem_norm"), x)
         for stage, (width, count) in enumerate(zip(self.widths, self.blocks, strict=True)):
             for block in range(count):
                 stride = 2 if stage > 0 and block == 0 else 1
-                x = BasicBlock(width, stride, dtype=self.dtype, name=f"stage_{stage}_block_{block}")(x, train=train)
+                name = f"stage_{stage}_block_{block}"
+                x = sparing(lambda block, x: block(x, train=train), BasicBlock(width, stride, dtype=self.dtype, name=name), x)
         pooled = jnp.mean(x.astype(jnp.promote_types(x.dtype, jnp.float32)), axis=(1, 2))
         return pooled.reshape(*views.shape[:-3], -1)
+
+
+def sparing(function: Callable[[Any, Array], Array], module: nn.Module, x: Array) -> Array:
+    """Return `function(module, x)`, of which the derivative keeps the convolutions' results and computes the rest again."""
+    return nn.remat(function, policy=jax.checkpoint_policies.save_only_these_names(CONVOLVED))(module, x)
 
 
 class Stem(nn.Module):
@@ -63,9 +71,7 @@ class Stem(nn.Module):
 
     def _convolve(self, x: Array, kernel: Array) -> Array:
         dtype = self.dtype or kernel.dtype
-        return jax.lax.conv_general_dilated(
-            x.astype(dtype), kernel.astype(dtype), (2, 2), ((3, 3), (3, 3)), dimension_numbers=("NHWC", "HWIO", "NHWC")
-        )
+        return convolve(x.astype(dtype), kernel.astype(dtype), stride=2)
 
 
 class BasicBlock(nn.Module):
@@ -80,22 +86,9 @@ class BasicBlock(nn.Module):
         """Map `[B, H, W, C]` to `[B, H / stride, W / stride, features]`."""
         shortcut = x
         if self.stride != 1 or x.shape[-1] != self.features:
-            shortcut = self._convolution(1, self.stride, "shortcut")(x)
+            shortcut = Convolution(self.features, 1, self.stride, self.dtype, name="shortcut")(x)
             shortcut = BatchNorm(self.features, name="shortcut_norm")(shortcut, train=train)
-        y = self._convolution(3, self.stride, "conv_0")(x)
+        y = Convolution(self.features, 3, self.stride, self.dtype, name="conv_0")(x)
         y = nn.relu(BatchNorm(self.features, name="norm_0")(y, train=train))
-        y = self._convolution(3, 1, "conv_1")(y)
+        y = Convolution(self.features, 3, dtype=self.dtype, name="conv_1")(y)
         return nn.relu(BatchNorm(self.features, name="norm_1")(y, train=train) + shortcut)
-
-    def _convolution(self, size: int, stride: int, name: str) -> nn.Conv:
-        pad = size // 2
-        return nn.Conv(
-            self.features,
-            (size, size),
-            (stride, stride),
-            padding=((pad, pad), (pad, pad)),
-            use_bias=False,
-            dtype=self.dtype,
-            kernel_init=he_fan_out,
-            name=name,
-        )

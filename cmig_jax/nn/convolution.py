@@ -1,0 +1,187 @@
+"""Convolutions of images, with the derivatives that a CPU needs written out.
+
+XLA's CPU compiler takes up to ten times as long for the derivative in the kernel as for the convolution itself. Here it is products of
+shifted images. A 3 x 3 kernel of stride 1, which is most of a ResNet, goes by Winograd's algorithm, forward and backward: two by two
+results at a time from 16 products instead of 36 (Lavin and Gray, CVPR 2016, F(2 x 2, 3 x 3)). Its transforms only add and halve, so that
+it rounds like the plain sum. Accelerators, whose libraries have all this, and half precision take XLA's own convolution.
+"""
+
+from __future__ import annotations
+
+import functools
+from collections.abc import Callable, Sequence
+
+import flax.linen as nn
+import jax
+import jax.numpy as jnp
+from jax import Array
+from jax.ad_checkpoint import checkpoint_name
+from jax.sharding import PartitionSpec
+
+HIGHEST = jax.lax.Precision.HIGHEST
+CONVOLVED = "convolved"  # names what derivatives may keep (`jax.checkpoint`)
+NUMBERS_AT_A_TIME = 2**20  # of what a loop over images makes of them: what a CPU's cache holds
+he_fan_out = nn.initializers.variance_scaling(2.0, "fan_out", "normal")
+
+# Winograd's matrices: of two results in a row from four pixels d and three weights g, A^T ((G g) * (B^T d)).
+B_T = ((1, 0, -1, 0), (0, 1, 1, 0), (0, -1, 1, 0), (0, 1, 0, -1))
+G = ((1.0, 0.0, 0.0), (0.5, 0.5, 0.5), (0.5, -0.5, 0.5), (0.0, 0.0, 1.0))
+A_T = ((1, 1, 1, 0), (0, 1, -1, -1))
+A = tuple(zip(*A_T, strict=True))
+
+
+class Convolution(nn.Module):
+    """A square convolution without bias, padded so that stride 1 keeps the size."""
+
+    features: int
+    size: int
+    stride: int = 1
+    dtype: jnp.dtype | None = None
+
+    @nn.compact
+    def __call__(self, x: Array) -> Array:
+        """Map `[B, H, W, C]` to `[B, ceil(H / stride), ceil(W / stride), features]`."""
+        kernel = self.param("kernel", he_fan_out, (self.size, self.size, x.shape[-1], self.features))
+        dtype = self.dtype or kernel.dtype
+        return checkpoint_name(convolve(x.astype(dtype), kernel.astype(dtype), self.stride), CONVOLVED)
+
+
+def convolve(x: Array, kernel: Array, stride: int = 1) -> Array:
+    """Convolve images `[B, H, W, C]` with a kernel `[s, s, C, C']`, s odd, zeros around them: `[B, ceil(H / stride), ..., C']`."""
+    if jax.default_backend() != "cpu" or jnp.finfo(x.dtype).bits < 32:
+        return _plain(x, kernel, stride)
+    mesh = jax.sharding.get_abstract_mesh()
+    if mesh.empty or mesh.size == 1 or len(x) % mesh.size:
+        return _convolve(x, kernel, stride)
+    # Each of several devices goes through its own images; XLA by itself would gather what a loop walks over.
+    images, whole = PartitionSpec(mesh.axis_names), PartitionSpec()
+    own = functools.partial(_convolve, stride=stride)
+    return jax.shard_map(own, mesh=mesh, in_specs=(images, whole), out_specs=images, check_vma=False)(x, kernel)
+
+
+def _plain(x: Array, kernel: Array, stride: int) -> Array:
+    pad = kernel.shape[0] // 2
+    return jax.lax.conv_general_dilated(x, kernel, (stride, stride), ((pad, pad), (pad, pad)), dimension_numbers=("NHWC", "HWIO", "NHWC"))
+
+
+def _is_winograd(kernel: Array, stride: int) -> bool:
+    return kernel.shape[0] == 3 and stride == 1
+
+
+@functools.partial(jax.custom_vjp, nondiff_argnames=("stride",))
+def _convolve(x: Array, kernel: Array, stride: int) -> Array:
+    return _winograd(x, kernel) if _is_winograd(kernel, stride) else _plain(x, kernel, stride)
+
+
+def _convolve_forward(x: Array, kernel: Array, stride: int) -> tuple[Array, tuple[Array, Array]]:
+    return _convolve(x, kernel, stride), (x, kernel)
+
+
+def _convolve_backward(stride: int, saved: tuple[Array, Array], gradient: Array) -> tuple[Array, Array]:
+    x, kernel = saved
+    if _is_winograd(kernel, stride):
+        return _winograd(gradient, kernel[::-1, ::-1].swapaxes(2, 3)), _winograd_of_kernel(x, gradient)
+    (of_x,) = jax.linear_transpose(lambda image: _plain(image, kernel, stride), x)(gradient)
+    return of_x, _of_kernel(x, gradient, kernel.shape[0], stride)
+
+
+_convolve.defvjp(_convolve_forward, _convolve_backward)
+
+
+def _of_kernel(x: Array, gradient: Array, size: int, stride: int) -> Array:
+    """Differentiate in the kernel: a product of the gradient with the image shifted to each place of the kernel."""
+    _, height, width, features = gradient.shape
+
+    def visit(x: Array, gradient: Array) -> Array:
+        pad = size // 2
+        padded = jnp.pad(x, ((0, 0), (pad, pad + stride), (pad, pad + stride), (0, 0)))
+        places = [(i, j) for i in range(size) for j in range(size)]
+        shifted = [padded[:, i : i + stride * height : stride, j : j + stride * width : stride][:, :height, :width] for i, j in places]
+        flat = gradient.reshape(-1, features)
+        if x.shape[-1] == 1:
+            return jnp.stack([part.reshape(-1) for part in shifted]) @ flat
+        return jnp.stack([jnp.einsum("pc,pd->cd", part.reshape(flat.shape[0], -1), flat) for part in shifted])
+
+    numbers = height * width * max(size**2 if x.shape[-1] == 1 else x.shape[-1], features)
+    return _sum_over_images(visit, numbers, x, gradient).reshape(size, size, x.shape[-1], features)
+
+
+def _winograd(x: Array, kernel: Array) -> Array:
+    weights = _square(G, kernel)  # [16, C, C']
+
+    def visit(x: Array) -> Array:
+        _, height, width, _ = x.shape
+        return _joined(jnp.einsum("tpc,tcd->tpd", _tiles(x), weights), height, width)
+
+    chunk = _images_at_a_time(x, 4 * x.shape[1] * x.shape[2] * max(kernel.shape[2:]))
+    if chunk == len(x):
+        return visit(x)
+    return jax.lax.map(visit, _split(x, chunk)).reshape(*x.shape[:-1], kernel.shape[-1])
+
+
+def _winograd_of_kernel(x: Array, gradient: Array) -> Array:
+    """Differentiate in the kernel: the transposes of Winograd's transforms around one product for each of the 16 places."""
+
+    def visit(x: Array, gradient: Array) -> Array:
+        padded = jnp.pad(gradient, ((0, 0), (0, gradient.shape[1] % 2), (0, gradient.shape[2] % 2), (0, 0)))
+        parts = _apply(A, [[padded[:, i::2, j::2] for j in range(2)] for i in range(2)])
+        return jnp.einsum("tpc,tpd->tcd", _tiles(x), jnp.stack(parts).reshape(16, -1, gradient.shape[-1]))
+
+    numbers = 4 * x.shape[1] * x.shape[2] * max(x.shape[-1], gradient.shape[-1])
+    total = _sum_over_images(visit, numbers, x, gradient).reshape(4, 4, x.shape[-1], -1)
+    g = jnp.asarray(G, total.dtype)
+    return jnp.einsum("ui,vj,uvcd->ijcd", g, g, total, precision=HIGHEST)
+
+
+def _tiles(x: Array) -> Array:
+    """Transform every tile of 4 x 4 pixels, two pixels apart, of the padded images: `[16, tiles, C]`."""
+    _, height, width, C = x.shape
+    padded = jnp.pad(x, ((0, 0), (1, 1 + height % 2), (1, 1 + width % 2), (0, 0)))
+    rows, columns = height + height % 2, width + width % 2
+    pixels = [[padded[:, i : i + rows : 2, j : j + columns : 2] for j in range(4)] for i in range(4)]
+    return jnp.stack(_apply(B_T, pixels)).reshape(16, -1, C)
+
+
+def _joined(products: Array, height: int, width: int) -> Array:
+    """Transform `[16, tiles, C]` to two by two results each, and lay these side by side: `[B, H, W, C]`."""
+    down, right, C = -(-height // 2), -(-width // 2), products.shape[-1]
+    places = products.reshape(4, 4, -1, down, right, C)
+    results = _apply(A_T, [[places[i, j] for j in range(4)] for i in range(4)])
+    rows = [jnp.stack(results[2 * i : 2 * i + 2], axis=3) for i in range(2)]
+    return jnp.stack(rows, axis=2).reshape(-1, 2 * down, 2 * right, C)[:, :height, :width]
+
+
+def _apply(matrix: Sequence[Sequence[int]], parts: Sequence[Sequence[Array]]) -> list[Array]:
+    """Multiply a square of arrays by a matrix of 0 and +-1 from the left and by its transpose from the right, row by row."""
+
+    def combine(row: Sequence[int], arrays: Sequence[Array]) -> Array:
+        terms = [x if sign > 0 else -x for sign, x in zip(row, arrays, strict=True) if sign]
+        return functools.reduce(jnp.add, terms)
+
+    left = [[combine(row, column) for column in zip(*parts, strict=True)] for row in matrix]
+    return [combine(row, line) for line in left for row in matrix]
+
+
+def _square(matrix: Sequence[Sequence[float]], kernel: Array) -> Array:
+    """Multiply a kernel `[3, 3, C, C']` by a `[4, 3]` matrix along both axes: `[16, C, C']`."""
+    m = jnp.asarray(matrix, kernel.dtype)
+    return jnp.einsum("ui,vj,ijcd->uvcd", m, m, kernel, precision=HIGHEST).reshape(-1, *kernel.shape[2:])
+
+
+def _sum_over_images(visit: Callable[..., Array], numbers: int, *arrays: Array) -> Array:
+    """Sum `visit` over chunks of images; `numbers` is what it makes of one image."""
+    chunk = _images_at_a_time(arrays[0], numbers)
+    if chunk == len(arrays[0]):
+        return visit(*arrays)
+    chunks = tuple(_split(x, chunk) for x in arrays)
+    start = jax.tree.map(lambda x: jnp.zeros(x.shape, x.dtype), jax.eval_shape(visit, *(x[0] for x in chunks)))
+    return jax.lax.scan(lambda total, parts: (total + visit(*parts), None), start, chunks)[0]
+
+
+def _images_at_a_time(x: Array, numbers: int) -> int:
+    most = max(1, NUMBERS_AT_A_TIME // numbers)
+    return max(n for n in range(1, min(most, len(x)) + 1) if len(x) % n == 0)
+
+
+def _split(x: Array, chunk: int) -> Array:
+    return x.reshape(-1, chunk, *x.shape[1:])

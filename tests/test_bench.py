@@ -1,5 +1,6 @@
 """The benchmark, tiny: its keys, finite ratios, and that both networks do the same work."""
 
+import functools
 import json
 import math
 import os
@@ -11,9 +12,10 @@ import numpy as np
 import pytest
 
 from cmig_jax.bench.cases import CASES, make_arrays
-from cmig_jax.bench.clock import Timing, in_turns
+from cmig_jax.bench.clock import KEPT, OURS, PYTORCH, Timing, in_turns
 from cmig_jax.bench.clouds import measure_clouds
 from cmig_jax.bench.memory import resident
+from cmig_jax.bench.worker import Worker
 
 pytest.importorskip("torch")
 
@@ -38,18 +40,31 @@ def test_both_networks_find_the_same_poses():
     np.testing.assert_allclose(ours.R, twin.numpy(), atol=1e-3)
 
 
+def test_a_worker_that_fails_is_named():
+    with (
+        Worker("tiny", "pytorch", "cpu", 0) as worker,
+        pytest.raises(RuntimeError, match=r"pytorch \(tiny\) ended with code 1 at 'training x'"),
+    ):
+        worker("training x")
+
+
 def test_no_repetitions_is_an_error():
     done = subprocess.run([sys.executable, "-m", "cmig_jax.bench", "--repetitions", "0"], capture_output=True, text=True, check=False)
     assert done.returncode == 1
     assert "expected at least 1" in done.stderr
 
 
-def test_work_is_done_in_turns_and_once_before():
-    calls = []
-    timing = in_turns(lambda: calls.append("a"), lambda: calls.append("b"), 3)
-    assert calls == ["a", "b"] * 4
-    assert Timing(4.0, 2.0, 1.1).as_json()["ratio"] == 2
-    assert timing.spread >= 1
+def test_work_is_done_in_turns():
+    calls, seconds = [], iter([4.0, 3.0, 1.0, 6.0, 3.0, 2.0, 5.0, 3.0, 1.0])
+
+    def work(who):
+        calls.append(who)
+        return next(seconds)
+
+    timing = in_turns({who: functools.partial(work, who) for who in (PYTORCH, KEPT, OURS)}, 3)
+    assert calls == [PYTORCH, KEPT, OURS] * 3
+    assert timing == Timing({PYTORCH: 5.0, KEPT: 3.0, OURS: 1.0}, spread=2.0)
+    assert timing.as_json() == {"ratio": 5, "ratio_kept": 3, "pytorch_s": 5, "pytorch_kept_s": 3, "ours_s": 1, "spread": 2}
 
 
 def test_inputs_are_a_function_of_the_seed():

@@ -28,6 +28,11 @@ class Case:
     image_size: int
     images: bool = True
 
+    @property
+    def stages(self) -> tuple[str, ...]:
+        """The stages that are timed alone."""
+        return ("point_encoder", "fusion", "scores", "matching") + (("image_encoder",) if self.images else ())
+
 
 @dataclass(frozen=True)
 class Arrays:

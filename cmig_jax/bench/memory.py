@@ -8,7 +8,7 @@ import sys
 from pathlib import Path
 from typing import Any, Literal
 
-Who = Literal["ours", "pytorch"]
+from cmig_jax.bench.worker import Who, network_of
 
 
 def measure(case: str, who: Who, what: str, device: str, rows: int) -> dict[str, float]:
@@ -43,14 +43,9 @@ def resident(field: Literal["VmHWM", "VmRSS"]) -> int:
     return next((int(line.split()[1]) * 1024 for line in lines if line.startswith(field)), 0)
 
 
-def main(case_name: str, who: Who, what: str, device: str, rows: int) -> dict[str, float]:
+def main(case: str, who: Who, what: str, device: str, rows: int) -> dict[str, float]:
     """Do it twice in this process; return the peaks."""
-    from cmig_jax.bench.networks import make_ours, make_twin  # torch or jax are loaded here, by the process that is measured
-
-    if who == "ours":
-        network: Any = make_ours(case_name, device, rows)
-    else:
-        network = make_twin(case_name, device)
+    network = network_of(case, who, device, rows)
     before = resident("VmRSS")
     work = getattr(network, what)()
     work()
@@ -60,5 +55,5 @@ def main(case_name: str, who: Who, what: str, device: str, rows: int) -> dict[st
 
 
 if __name__ == "__main__":
-    case_name, who, what, device, rows = sys.argv[1:]
-    print(json.dumps(main(case_name, who, what, device, int(rows))))  # type: ignore[arg-type]
+    case, who, what, device, rows = sys.argv[1:]
+    print(json.dumps(main(case, who, what, device, int(rows))))  # type: ignore[arg-type]

@@ -2,29 +2,20 @@
 
 from __future__ import annotations
 
-import os
-from pathlib import Path
-
 import jax
 
 from cmig_jax.bench.cases import CASES, make_arrays
 from cmig_jax.bench.ours import Ours
+from cmig_jax.compilation import keep_compiled_programs
 from cmig_jax.config import ComputeConfig
 from cmig_jax.parity.recorded import named_weights
 from cmig_jax.parity.twin_bench import TwinBench
 from cmig_jax.parity.twin_run import state_shapes
 
 
-def use_compilation_cache() -> str:
-    """Keep compiled programs on disk; return the folder (JAX_COMPILATION_CACHE_DIR, if that is set)."""
-    folder = os.environ.get("JAX_COMPILATION_CACHE_DIR") or str(Path.home() / ".cache" / "cmig_jax" / "compiled")
-    jax.config.update("jax_compilation_cache_dir", folder)
-    return folder
-
-
 def make_ours(name: str, device: str, rows: int = 0) -> Ours:
     """Build our network on a case's inputs."""
-    use_compilation_cache()
+    keep_compiled_programs()
     jax.config.update("jax_platforms", "cuda" if device == "gpu" else "cpu")
     return Ours(CASES[name], make_arrays(CASES[name]), ComputeConfig(rows=rows))
 

@@ -84,13 +84,13 @@ class Ours:
             batch_stats=jax.tree.map(jnp.copy, self.variables["batch_stats"]),
             opt_state=rule.init(self.variables["params"]),
         )
-        start = time.perf_counter()
-        step = make_step(self.model, rule, self.config, mesh).lower(state, self.batch).compile()  # pyright: ignore[reportFunctionMemberAccess]
+        key, start = jax.random.key(0), time.perf_counter()
+        step = make_step(self.model, rule, self.config, mesh).lower(state, self.batch, key).compile()  # pyright: ignore[reportFunctionMemberAccess]
         self._note("training", step, start)
 
         def work() -> Array:
             nonlocal state
-            state, scalars = step(state, self.batch)
+            state, scalars = step(state, self.batch, key)
             return scalars["loss"].block_until_ready()
 
         return work

@@ -1,14 +1,17 @@
-"""Measure one case: times in turns, memory in separate processes."""
+"""Measure one case: times in turns, then memory, each network in processes of its own."""
 
 from __future__ import annotations
 
+import contextlib
+import functools
 from typing import Any
 
 from tqdm import tqdm
 
-from cmig_jax.bench.clock import in_turns
+from cmig_jax.bench.cases import CASES
+from cmig_jax.bench.clock import KEPT, OURS, PYTORCH, in_turns
 from cmig_jax.bench.memory import measure
-from cmig_jax.bench.networks import make_ours, make_twin
+from cmig_jax.bench.worker import Who, Worker
 
 
 def run(name: str, repetitions: int, device: str, rows: int, memory: bool, stages: bool) -> dict[str, Any]:
@@ -19,12 +22,12 @@ def run(name: str, repetitions: int, device: str, rows: int, memory: bool, stage
         repetitions: of each measurement; medians are reported.
         device: `cpu` or `gpu`.
         rows: `compute.rows` of ours.
-        memory: also take peak memory, each network in processes of its own.
+        memory: also take peak memory.
         stages: also time each stage alone.
 
     Returns:
-        `inference` and `training`, each with `whole` and the stages (`ratio`, `pytorch_s`, `ours_s`), `memory` of a training step,
-        `memory_inference`, and `compile_s`; `ratio` is PyTorch over ours.
+        `inference` and `training`, each with `whole` and the stages (`Timing.as_json`, and ours' costs), `memory` of a training step,
+        `memory_inference`, and `compile_s`.
     """
     results = _times(name, repetitions, device, rows, stages)
     if memory:
@@ -33,21 +36,24 @@ def run(name: str, repetitions: int, device: str, rows: int, memory: bool, stage
 
 
 def _times(name: str, repetitions: int, device: str, rows: int, stages: bool) -> dict[str, Any]:
-    ours, twin = make_ours(name, device, rows), make_twin(name, device)
+    networks: tuple[Who, ...] = (PYTORCH, KEPT, OURS) if device == "cpu" else (PYTORCH, OURS)
+    whats = ["whole", *(CASES[name].stages if stages else ())]
     results: dict[str, Any] = {"inference": {}, "training": {}}
-    for mode, train in (("inference", False), ("training", True)):
-        pairs = {"whole": (twin.training() if train else twin.inference(), ours.training() if train else ours.inference())}
-        if stages:
-            theirs, own = twin.stages(train), ours.stages(train)
-            pairs |= {stage: (theirs[stage], own[stage]) for stage in own}
-        for what, works in tqdm(pairs.items(), desc=f"{name} {mode}", leave=False, disable=None):
-            results[mode][what] = in_turns(*works, repetitions).as_json() | ours.costs[mode if what == "whole" else f"{mode}.{what}"]
-    results["compile_s"] = {mode: ours.compile_seconds[mode] for mode in ("inference", "training")}
-    return results
+    with contextlib.ExitStack() as stack:
+        workers = {who: stack.enter_context(Worker(name, who, device, rows)) for who in networks}
+        for mode, found in results.items():
+            for what in tqdm(whats, desc=f"{name} {mode}", leave=False, disable=None):
+                works = {who: functools.partial(worker, f"{mode} {what}") for who, worker in workers.items()}
+                found[what] = in_turns(works, repetitions).as_json()
+        ours = workers[OURS].costs()
+    for mode in ("inference", "training"):
+        for what, row in results[mode].items():
+            row |= ours["costs"][mode if what == "whole" else f"{mode}.{what}"]
+    return results | {"compile_s": {mode: ours["compile_seconds"][mode] for mode in ("inference", "training")}}
 
 
 def _memory(name: str, what: str, device: str, rows: int) -> dict[str, float]:
-    theirs, ours = (measure(name, who, what, device, rows) for who in ("pytorch", "ours"))
+    theirs, ours = (measure(name, who, what, device, rows) for who in (PYTORCH, OURS))
     return {
         "ratio": theirs["peak_gb"] / ours["peak_gb"],
         "pytorch_gb": theirs["peak_gb"],

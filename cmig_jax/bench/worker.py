@@ -1,0 +1,99 @@
+"""One network in a process of its own, which does a piece of work when it is told to: `Worker` starts it, this module run is it.
+
+PyTorch and JAX thus share neither threads nor the C library's memory, and PyTorch can be measured as it is installed as well as with
+freed memory kept (`cmig_jax.allocator`), as ours always is.
+"""
+
+from __future__ import annotations
+
+import json
+import os
+import subprocess
+import sys
+import time
+from types import TracebackType
+from typing import Any, Literal
+
+from cmig_jax.allocator import keep_freed_memory
+
+Who = Literal["pytorch", "pytorch_kept", "ours"]
+COSTS = "costs"
+
+
+class Worker:
+    """A process that holds one network; ends with the `with` block.
+
+    Args:
+        case: name of the case.
+        who: which network, and how it allocates.
+        device: `cpu` or `gpu`.
+        rows: `compute.rows` of ours.
+    """
+
+    def __init__(self, case: str, who: Who, device: str, rows: int) -> None:
+        command = [sys.executable, "-m", "cmig_jax.bench.worker", case, who, device, str(rows)]
+        environment = {**os.environ, "XLA_PYTHON_CLIENT_PREALLOCATE": "false"}  # PyTorch needs its share of a GPU
+        self._name = f"{who} ({case})"
+        self._process = subprocess.Popen(command, env=environment, stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True, bufsize=1)
+
+    def __call__(self, work: str) -> float:
+        """Do a piece of work (`inference whole`, `training fusion`, ...) and return its seconds; the first time also once before."""
+        return self._ask(work)
+
+    def costs(self) -> dict[str, Any]:
+        """Return `compile_seconds` and `costs` of ours."""
+        return self._ask(COSTS)
+
+    def _ask(self, line: str) -> Any:
+        assert self._process.stdin is not None
+        assert self._process.stdout is not None
+        try:
+            self._process.stdin.write(f"{line}\n")
+            answer = self._process.stdout.readline()
+        except BrokenPipeError:
+            answer = ""
+        if not answer:
+            raise RuntimeError(f"{self._name} ended with code {self._process.wait()} at {line!r}; what it said stands above")
+        return json.loads(answer)
+
+    def __enter__(self) -> Worker:
+        return self
+
+    def __exit__(self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None) -> None:
+        self._process.kill()
+        self._process.communicate()
+
+
+def network_of(case: str, who: Who, device: str, rows: int) -> Any:
+    """Build a network in this process."""
+    if who != "pytorch":
+        keep_freed_memory()  # before torch or jax, which are loaded below, start their threads
+    from cmig_jax.bench.networks import make_ours, make_twin
+
+    return make_ours(case, device, rows) if who == "ours" else make_twin(case, device)
+
+
+def main(case: str, who: Who, device: str, rows: int) -> None:
+    """Answer one line of standard input after the other."""
+    network = network_of(case, who, device, rows)
+    works: dict[str, Any] = {}
+    for line in sys.stdin:
+        name = line.strip()
+        if name == COSTS:
+            print(json.dumps({"compile_seconds": network.compile_seconds, "costs": network.costs}), flush=True)
+            continue
+        if name not in works:
+            mode, what = name.split()
+            if what == "whole":
+                works[name] = getattr(network, mode)()
+            else:
+                works |= {f"{mode} {stage}": work for stage, work in network.stages(mode == "training").items()}
+            works[name]()
+        start = time.perf_counter()
+        works[name]()
+        print(time.perf_counter() - start, flush=True)
+
+
+if __name__ == "__main__":
+    case, who, device, rows = sys.argv[1:]
+    main(case, who, device, int(rows))  # type: ignore[arg-type]

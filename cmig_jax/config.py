@@ -140,6 +140,8 @@ class MatchingConfig:
     """Iterations n, each with its own weights."""
     repeats: int = 0
     """Further iterations at evaluation, with the weights of the last; 0 is the paper's."""
+    correspondence: Literal["hard", "soft"] = "hard"
+    """Partner of a source keypoint: the target keypoint that matches best, or the mean of all under the softmax of the matching."""
     feature_widths: tuple[int, ...] = (256, 128, 64, 32, 32, 32)
     """Channels of the feature similarity network."""
     coordinate_widths: tuple[int, ...] = (32, 32, 32)

@@ -72,12 +72,15 @@ NO_IMAGES = {"model.fusion.image": "none", "loss.cross_modal": "off"}
 NO_CONTRAST = {"loss.overlap": "off", "loss.cross_modal": "off"}
 ALL_KEYPOINTS = {"model.keypoints.test_count": 768}
 REPEATED = {"model.matching.repeats": 5}
-AT_TEST = ALL_KEYPOINTS | REPEATED
+SOFT = {"model.matching.correspondence": "soft"}
+AT_TEST = ALL_KEYPOINTS | REPEATED | SOFT
+AS_TRAINED = {"model.keypoints.test_count": 0, "model.matching.repeats": 0, "model.matching.correspondence": "hard"}
 OBSERVED = {"views.of": "both"}  # a recording has no complete object to render
 CORRECTIONS: dict[str, Flags] = {
     "own scores": {"model.keypoints.score_from": "own"},
     "linear scores": {"model.keypoints.activation": "linear"},
     "own and linear scores": {"model.keypoints.score_from": "own", "model.keypoints.activation": "linear"},
+    "random keypoints": {"model.keypoints.select": "random"},
     "weighted centroids": {"model.pose.centroid": "weighted"},
     "view tokens": {"model.fusion.image": "views"},
     "observed views": OBSERVED,
@@ -185,9 +188,10 @@ EXPERIMENTS: dict[str, Experiment] = {
             *(Row(f"released + {name}", "released", flags) for name, flags in CORRECTIONS.items()),
             Row("released + all keypoints at test", "released", test=ALL_KEYPOINTS),
             Row("released + repeated last iteration at test", "released", test=REPEATED),
-            Row("released + both at test", "released", test=AT_TEST),
-            *(Row(f"released + {name} + both at test", "released", flags, test=AT_TEST) for name, flags in CORRECTIONS.items()),
-            Row("corrected without both", "corrected", test={"model.keypoints.test_count": 0, "model.matching.repeats": 0}),
+            Row("released + soft partners at test", "released", test=SOFT),
+            Row("released + all three at test", "released", test=AT_TEST),
+            *(Row(f"released + {name} + all three at test", "released", flags, test=AT_TEST) for name, flags in CORRECTIONS.items()),
+            Row("corrected without the three", "corrected", test=AS_TRAINED),
             Row("corrected", "corrected"),
         ),
         baselines=True,
@@ -197,10 +201,10 @@ EXPERIMENTS: dict[str, Experiment] = {
         NOISE | UNSEEN,
         (
             Row("released", "released", test={"data.sampling": "twice"}),
-            Row("released + both at test", "released", test={"data.sampling": "twice"} | AT_TEST),
+            Row("released + all three at test", "released", test={"data.sampling": "twice"} | AT_TEST),
             Row("corrected", "corrected", test={"data.sampling": "twice"}),
             Row("released, trained so", "released", {"data.sampling": "twice"}),
-            Row("released, trained so, + both at test", "released", {"data.sampling": "twice"}, test=AT_TEST),
+            Row("released, trained so, + all three at test", "released", {"data.sampling": "twice"}, test=AT_TEST),
             Row("corrected, trained so", "corrected", {"data.sampling": "twice"}),
         ),
         baselines=True,

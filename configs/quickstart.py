@@ -30,7 +30,7 @@ def quickstart() -> Config:
 
 
 def small_network() -> ModelConfig:
-    """The corrected network with 128 channels and 64 keypoints."""
+    """128 channels and 64 keypoints; observed views as tokens, each cloud's own linear scores, weighted centroids; at test all points."""
     return ModelConfig(
         points=PointsConfig(k=16, widths=(32, 32, 64, 64), dim=128),
         image=ImageConfig(widths=(16, 32, 64, 128), blocks=(1, 1, 1, 1)),

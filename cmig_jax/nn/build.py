@@ -38,6 +38,7 @@ def build(config: Config) -> CMIGNet:
         keypoints=m.keypoints.count,
         test_keypoints=m.keypoints.test_count,
         match_threshold=config.loss.match_threshold,
+        correspondence=m.matching.correspondence,
         centroid=m.pose.centroid,
         pose_gradient=m.pose.gradient,
         rows=rows,

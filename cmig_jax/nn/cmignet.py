@@ -21,6 +21,7 @@ from cmig_jax.nn.matching import CMIGNetHead, IDAMHead, KeypointSet, Match, PCRN
 from cmig_jax.nn.resnet import ViewEncoder
 from cmig_jax.structs import Batch, Iteration, Keypoints, Prediction, RigidTransform
 
+HIGHEST = jax.lax.Precision.HIGHEST
 MATCH_LIMIT = 20.0  # |M| beyond which the reference clips, so that no softmax saturates
 
 
@@ -38,6 +39,7 @@ class CMIGNet(nn.Module):
         score: significance scores (MP), or None where keypoints are not predicted.
         keypoints: K.
         test_keypoints: K in evaluation, at most all points; 0 is `keypoints`.
+        correspondence: a source keypoint's partner is the `hard` best target keypoint, or the `soft` mean of all under the softmax of M.
         repeats: iterations in evaluation beyond those trained, with the weights of the last.
     """
 
@@ -54,6 +56,7 @@ class CMIGNet(nn.Module):
     test_keypoints: int = 0
     repeats: int = 0
     match_threshold: float = 0.05
+    correspondence: Literal["hard", "soft"] = "hard"
     centroid: Literal["weighted", "unweighted"] = "weighted"
     pose_gradient: Literal["stopped", "through"] = "stopped"
     rows: int = 0
@@ -189,7 +192,10 @@ class CMIGNet(nn.Module):
         total = match.feature if match.coordinate is None else match.feature + match.coordinate
         total = jnp.clip(total, -MATCH_LIMIT, MATCH_LIMIT)
         correspondence = jnp.argmax(total, axis=-1)
-        corresponding = jnp.take_along_axis(target.points, correspondence[..., None], axis=1)
+        if self.correspondence == "soft":
+            corresponding = jnp.matmul(nn.softmax(total, axis=-1), target.points, precision=HIGHEST)
+        else:
+            corresponding = jnp.take_along_axis(target.points, correspondence[..., None], axis=1)
         weight = credible_half(nn.sigmoid(match.logit))
         step = weighted_procrustes(source.points, corresponding, weight, self.centroid)
         if self.pose_gradient == "stopped":

@@ -29,7 +29,7 @@ from cmig_jax.structs import Batch, RigidTransform
 
 
 def tiny(head="cmignet", select="predicted", score_from="own", activation="linear", precision="float32", rows=0, loss="off", **parts):
-    """Describe a network of a few channels; fusion and pose flags come in `parts`."""
+    """Describe a network of a few channels; flags of fusion, matching and pose come in `parts`."""
     return Config(
         data=DataConfig(points=100),
         views=ViewsConfig(count=2, layout="ring", size=16),
@@ -38,7 +38,7 @@ def tiny(head="cmignet", select="predicted", score_from="own", activation="linea
             image=ImageConfig(widths=(4, 16), blocks=(1, 1)),
             fusion=FusionConfig(heads=2, feed_forward=16, **parts.get("fusion", {})),
             keypoints=KeypointsConfig(count=32, select=select, score_from=score_from, activation=activation),
-            matching=MatchingConfig(head=head, iterations=2, feature_widths=(8, 8), coordinate_widths=(8,)),
+            matching=MatchingConfig(head=head, iterations=2, feature_widths=(8, 8), coordinate_widths=(8,), **parts.get("matching", {})),
             pose=PoseConfig(**parts.get("pose", {})),
         ),
         loss=LossConfig(cross_modal=loss),
@@ -145,6 +145,16 @@ def test_the_pose_is_the_composition_of_the_steps(prediction):
         np.testing.assert_array_equal(first.source, keypoints)
 
 
+def test_soft_partners_are_means_under_the_softmax_of_the_matching(network, prediction, x64):
+    soft = evaluate(dataclasses.replace(network[0], correspondence="soft"), network[1], pairs())
+    first, hard = soft.iterations[0], prediction.iterations[0]
+    np.testing.assert_array_equal(first.correspondence, hard.correspondence)
+    targets = np.take_along_axis(pairs().target, np.asarray(soft.keypoints.target_index)[..., None], 1)
+    likelihood = np.exp(first.match) / np.exp(first.match).sum(-1, keepdims=True)
+    np.testing.assert_allclose(first.corresponding, likelihood @ targets, atol=1e-12)
+    assert np.abs(first.corresponding - hard.corresponding).max() > 0.1
+
+
 def test_keypoints_are_the_points_of_highest_score(prediction):
     for scores, index in (
         (prediction.source_scores, prediction.keypoints.source_index),
@@ -167,6 +177,7 @@ VARIANTS = {
     "random": {"select": "random"},
     "all": {"select": "all"},
     "all in rows": {"select": "all", "rows": 13},
+    "soft": {"matching": {"correspondence": "soft"}},
     "through": {"pose": {"gradient": "through"}},
     "bfloat16": {"precision": "bfloat16", "fusion": {"image": "views"}},
     "bfloat16 idam": {"precision": "bfloat16", "head": "idam", "fusion": {"image": "transformer"}},

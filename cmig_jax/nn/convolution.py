@@ -15,11 +15,9 @@ import flax.linen as nn
 import jax
 import jax.numpy as jnp
 from jax import Array
-from jax.ad_checkpoint import checkpoint_name
 from jax.sharding import PartitionSpec
 
 HIGHEST = jax.lax.Precision.HIGHEST
-CONVOLVED = "convolved"  # names what derivatives may keep (`jax.checkpoint`)
 NUMBERS_AT_A_TIME = 2**20  # of what a loop over images makes of them: what a CPU's cache holds
 he_fan_out = nn.initializers.variance_scaling(2.0, "fan_out", "normal")
 
@@ -43,7 +41,7 @@ class Convolution(nn.Module):
         """Map `[B, H, W, C]` to `[B, ceil(H / stride), ceil(W / stride), features]`."""
         kernel = self.param("kernel", he_fan_out, (self.size, self.size, x.shape[-1], self.features))
         dtype = self.dtype or kernel.dtype
-        return checkpoint_name(convolve(x.astype(dtype), kernel.astype(dtype), self.stride), CONVOLVED)
+        return convolve(x.astype(dtype), kernel.astype(dtype), self.stride)
 
 
 def convolve(x: Array, kernel: Array, stride: int = 1) -> Array:

@@ -7,15 +7,11 @@ response to the constant image `mean_c / std_c`, which is computed once. The sam
 
 from __future__ import annotations
 
-from collections.abc import Callable
-from typing import Any
-
 import flax.linen as nn
-import jax
 import jax.numpy as jnp
 from jax import Array
 
-from cmig_jax.nn.convolution import CONVOLVED, Convolution, convolve, he_fan_out
+from cmig_jax.nn.convolution import Convolution, convolve, he_fan_out
 from cmig_jax.nn.norm import BatchNorm
 from cmig_jax.nn.pooling import max_pool
 
@@ -34,19 +30,14 @@ class ViewEncoder(nn.Module):
     def __call__(self, views: Array, *, train: bool) -> Array:
         """Encode views `[..., H, W, 1]` (uint8 depth) or `[..., H, W, 3]` (normalised RGB) to `[..., widths[-1]]`."""
         x = Stem(self.widths[0], dtype=self.dtype, name="stem")(views.reshape(-1, *views.shape[-3:]))
-        x = sparing(lambda norm, x: max_pool(nn.relu(norm(x, train=train))), BatchNorm(self.widths[0], name="stem_norm"), x)
+        x = nn.relu(BatchNorm(self.widths[0], name="stem_norm")(x, train=train))
+        x = max_pool(x)
         for stage, (width, count) in enumerate(zip(self.widths, self.blocks, strict=True)):
             for block in range(count):
                 stride = 2 if stage > 0 and block == 0 else 1
-                name = f"stage_{stage}_block_{block}"
-                x = sparing(lambda block, x: block(x, train=train), BasicBlock(width, stride, dtype=self.dtype, name=name), x)
+                x = BasicBlock(width, stride, dtype=self.dtype, name=f"stage_{stage}_block_{block}")(x, train=train)
         pooled = jnp.mean(x.astype(jnp.promote_types(x.dtype, jnp.float32)), axis=(1, 2))
         return pooled.reshape(*views.shape[:-3], -1)
-
-
-def sparing(function: Callable[[Any, Array], Array], module: nn.Module, x: Array) -> Array:
-    """Return `function(module, x)`, of which the derivative keeps the convolutions' results and computes the rest again."""
-    return nn.remat(function, policy=jax.checkpoint_policies.save_only_these_names(CONVOLVED))(module, x)
 
 
 class Stem(nn.Module):

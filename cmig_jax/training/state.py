@@ -18,8 +18,6 @@ from cmig_jax.nn.cmignet import CMIGNet
 from cmig_jax.structs import Batch, Prediction, RigidTransform
 from cmig_jax.training.mesh import replicated, sharing, split
 
-# XLA's schedule for a CPU holds a fifth less at a time if it does not start independent work early, and is no slower.
-SPARING = {"xla_cpu_enable_concurrency_optimized_scheduler": False}
 Step = Callable[["TrainState", Batch, Array], tuple["TrainState", dict[str, Array]]]
 
 
@@ -105,6 +103,4 @@ def make_step(model: CMIGNet, optimizer: optax.GradientTransformation, config: C
         kept = jax.tree.map(lambda new, old: jnp.where(finite, new, old), changed, state)
         return kept.replace(step=state.step + 1), {"loss": loss, **terms, "gradient_norm": norm}
 
-    shardings = (replicated(mesh), split(mesh), None)
-    options = SPARING if mesh.devices.flat[0].platform == "cpu" else None
-    return jax.jit(step, donate_argnums=0, in_shardings=shardings, out_shardings=replicated(mesh), compiler_options=options)
+    return jax.jit(step, donate_argnums=0, in_shardings=(replicated(mesh), split(mesh), None), out_shardings=replicated(mesh))

@@ -18,7 +18,7 @@ from jax import Array
 from jax.sharding import PartitionSpec
 
 HIGHEST = jax.lax.Precision.HIGHEST
-NUMBERS_AT_A_TIME = 2**20  # of what a loop over images makes of them: what a CPU's cache holds
+NUMBERS_AT_A_TIME = 2**21  # of what a loop over images makes of them: what a CPU's cache holds
 he_fan_out = nn.initializers.variance_scaling(2.0, "fan_out", "normal")
 
 # Winograd's matrices: of two results in a row from four pixels d and three weights g, A^T ((G g) * (B^T d)).

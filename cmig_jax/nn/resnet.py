@@ -8,6 +8,7 @@ response to the constant image `mean_c / std_c`, which is computed once. The sam
 from __future__ import annotations
 
 import flax.linen as nn
+import jax
 import jax.numpy as jnp
 from jax import Array
 
@@ -54,11 +55,12 @@ class Stem(nn.Module):
             return self._convolve(images, kernel)
         mean, std = (jnp.asarray(v, kernel.dtype)[None, None, :, None] for v in (IMAGENET_MEAN, IMAGENET_STD))
         grey = jnp.sum(kernel / std, axis=2, keepdims=True)
-        constant = jnp.sum(kernel * mean / std, axis=2, keepdims=True)
+        constant = -jnp.sum(kernel * mean / std, axis=2, keepdims=True)
         response = self._convolve(jnp.ones((1, *images.shape[1:]), kernel.dtype), constant)
         # As a product, so that its derivative is one too: on a CPU a sum over the first axis of a large array is many times slower.
-        repeated = jnp.einsum("b,hwc->bhwc", jnp.ones(len(images), response.dtype), response[0])
-        return self._convolve(images.astype(kernel.dtype) / 255, grey) - repeated
+        ones = jnp.ones((len(images), 1), response.dtype)
+        repeated = jnp.matmul(ones, response.reshape(1, -1), precision=jax.lax.Precision.HIGHEST).reshape(-1, *response.shape[1:])
+        return self._convolve(images.astype(kernel.dtype) / 255, grey) + repeated
 
     def _convolve(self, x: Array, kernel: Array) -> Array:
         dtype = self.dtype or kernel.dtype

@@ -36,6 +36,7 @@ class Row:
         preset: what the row starts from.
         flags: what it changes in training and test.
         test: what it changes at test only.
+        then_icp: whether point-to-point ICP finishes at test, as `evaluate.py` does beside the network alone.
         quoted: the paper's figures.
     """
 
@@ -43,6 +44,7 @@ class Row:
     preset: Preset
     flags: Flags = field(default_factory=dict)
     test: Flags = field(default_factory=dict)
+    then_icp: bool = False
     quoted: Quoted | None = None
 
 
@@ -193,6 +195,8 @@ EXPERIMENTS: dict[str, Experiment] = {
             *(Row(f"released + {name} + all three at test", "released", flags, test=AT_TEST) for name, flags in CORRECTIONS.items()),
             Row("corrected without the three", "corrected", test=AS_TRAINED),
             Row("corrected", "corrected"),
+            Row("released, then ICP", "released", then_icp=True),
+            Row("corrected, then ICP", "corrected", then_icp=True),
         ),
         baselines=True,
     ),
@@ -206,6 +210,10 @@ EXPERIMENTS: dict[str, Experiment] = {
             Row("released, trained so", "released", {"data.sampling": "twice"}),
             Row("released, trained so, + all three at test", "released", {"data.sampling": "twice"}, test=AT_TEST),
             Row("corrected, trained so", "corrected", {"data.sampling": "twice"}),
+            Row("released, then ICP", "released", test={"data.sampling": "twice"}, then_icp=True),
+            Row("corrected, then ICP", "corrected", test={"data.sampling": "twice"}, then_icp=True),
+            Row("released, trained so, then ICP", "released", {"data.sampling": "twice"}, then_icp=True),
+            Row("corrected, trained so, then ICP", "corrected", {"data.sampling": "twice"}, then_icp=True),
         ),
         baselines=True,
     ),
@@ -230,13 +238,19 @@ EXPERIMENTS: dict[str, Experiment] = {
     "scans": Experiment(
         "raw range scans of the Stanford bunny and the like, true partial pairs, by networks trained on ModelNet40",
         NOISE,
-        _three_presets(test={"data.source": "stanford-scans"} | OBSERVED),
+        (
+            *_three_presets(test={"data.source": "stanford-scans"} | OBSERVED),
+            Row("corrected, then ICP", "corrected", test={"data.source": "stanford-scans"} | OBSERVED, then_icp=True),
+        ),
         baselines=True,
     ),
     "fragments": Experiment(
         "neighbouring fragments of 7-Scenes, true partial pairs, by networks trained on ModelNet40",
         NOISE,
-        _three_presets(test={"data.source": "sevenscenes-fragments"} | OBSERVED),
+        (
+            *_three_presets(test={"data.source": "sevenscenes-fragments"} | OBSERVED),
+            Row("corrected, then ICP", "corrected", test={"data.source": "sevenscenes-fragments"} | OBSERVED, then_icp=True),
+        ),
         baselines=True,
     ),
 }

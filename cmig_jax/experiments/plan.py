@@ -46,7 +46,8 @@ class Job:
     @property
     def evaluation(self) -> str:
         """The folder of its results inside the run folder: one for each way of testing."""
-        return f"evaluation-{hashlib.sha256(to_json(self.test).encode()).hexdigest()[:8]}"
+        name = f"evaluation-{hashlib.sha256(to_json(self.test).encode()).hexdigest()[:8]}"
+        return f"{name}-then-icp" if self.row.then_icp else name
 
     def commands(self) -> tuple[str, str]:
         """Return what to type to train this network, and to evaluate it."""

@@ -16,7 +16,7 @@ from cmig_jax.config import Config, to_json
 from cmig_jax.evaluation import METADATA, RESULTS, Method, evaluate, one_by_one
 from cmig_jax.experiments.plan import Job
 from cmig_jax.registration import load
-from cmig_jax.report.testing import pairs_to_test
+from cmig_jax.report.testing import methods_for, pairs_to_test
 from cmig_jax.training.checkpoint import check_config, last_step
 from cmig_jax.training.loop import NonFiniteLoss, train
 
@@ -111,10 +111,11 @@ def is_trained(run: Path, config: Config) -> bool:
 def _evaluate(job: Job, limit: int | None) -> dict[str, Any]:
     batch = job.training.optim.batch
     network = load(job.run, "best", batch, config=job.test)
-    methods: dict[str, Method] = {NETWORK: lambda pairs: network([dict(pair) for pair in pairs])}
+
+    method = methods_for(network)[f"{NETWORK} + ICP" if job.row.then_icp else NETWORK]
     folder = job.run / job.evaluation
     results = evaluate(
-        pairs_to_test(job.test, limit), methods, folder, command=job.commands()[1], config=_settings(job, limit), chunk=batch
+        pairs_to_test(job.test, limit), {NETWORK: method}, folder, command=job.commands()[1], config=_settings(job, limit), chunk=batch
     )
     jax.clear_caches()
     return results

@@ -77,6 +77,9 @@ def test_rows_that_are_tested_differently_have_different_results():
     assert real.run == shuffled.run == zero.run
     assert len({real.evaluation, shuffled.evaluation, zero.evaluation}) == 3
     assert jobs("corrections")[0].evaluation == real.evaluation
+    alone, finished = (next(job for job in jobs("scans") if job.row.label == label) for label in ("corrected", "corrected, then ICP"))
+    assert (alone.run, alone.test) == (finished.run, finished.test)
+    assert alone.evaluation != finished.evaluation
 
 
 def test_corrected_is_released_with_the_corrections_that_help():

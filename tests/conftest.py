@@ -1,5 +1,4 @@
-"""Eight virtual CPU devices, set before jax starts, and code made quickly rather than quick code, since a test compiles for longer than
-it computes; rank promotion is an error. And a network, clouds and a run that take seconds."""
+"""Eight virtual CPU devices, set before jax starts; rank promotion is an error. And a network, clouds and a run that take seconds."""
 
 import dataclasses
 import importlib.util
@@ -13,7 +12,7 @@ import h5py
 import numpy as np
 import pytest
 
-os.environ["XLA_FLAGS"] = os.environ.get("XLA_FLAGS", "") + " --xla_force_host_platform_device_count=8 --xla_backend_optimization_level=0"
+os.environ["XLA_FLAGS"] = os.environ.get("XLA_FLAGS", "") + " --xla_force_host_platform_device_count=8"
 os.environ["JAX_PLATFORMS"] = "cpu"
 import jax
 

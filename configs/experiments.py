@@ -99,6 +99,12 @@ def _three_presets(quoted: Quoted | None = None, test: Flags = UNCHANGED) -> tup
     )
 
 
+def _recorded(source: str) -> tuple[Row, ...]:
+    """The three presets on recorded pairs, and ours finished by ICP."""
+    test = {"data.source": source} | OBSERVED
+    return (*_three_presets(test=test), Row("corrected, then ICP", "corrected", test=test, then_icp=True))
+
+
 FULL = Quoted(1.472, 0.632, 0.0058, 0.0036)
 
 EXPERIMENTS: dict[str, Experiment] = {
@@ -238,19 +244,13 @@ EXPERIMENTS: dict[str, Experiment] = {
     "scans": Experiment(
         "raw range scans of the Stanford bunny and the like, true partial pairs, by networks trained on ModelNet40",
         NOISE,
-        (
-            *_three_presets(test={"data.source": "stanford-scans"} | OBSERVED),
-            Row("corrected, then ICP", "corrected", test={"data.source": "stanford-scans"} | OBSERVED, then_icp=True),
-        ),
+        _recorded("stanford-scans"),
         baselines=True,
     ),
     "fragments": Experiment(
         "neighbouring fragments of 7-Scenes, true partial pairs, by networks trained on ModelNet40",
         NOISE,
-        (
-            *_three_presets(test={"data.source": "sevenscenes-fragments"} | OBSERVED),
-            Row("corrected, then ICP", "corrected", test={"data.source": "sevenscenes-fragments"} | OBSERVED, then_icp=True),
-        ),
+        _recorded("sevenscenes-fragments"),
         baselines=True,
     ),
 }

@@ -19,9 +19,16 @@ def keep_freed_memory() -> None:
 
     Call it before JAX starts its threads: a thread that already has an arena of its own returns large blocks as before.
     """
-    if platform.libc_ver()[0] != "glibc":
-        return
-    with contextlib.suppress(OSError, AttributeError):
-        mallopt = ctypes.CDLL(None).mallopt
-        for parameter, value in ((M_ARENA_MAX, 1), (M_MMAP_MAX, 0), (M_TRIM_THRESHOLD, -1)):
-            mallopt(parameter, value)
+    for parameter, value in ((M_ARENA_MAX, 1), (M_MMAP_MAX, 0), (M_TRIM_THRESHOLD, -1)):
+        _call_glibc("mallopt", parameter, value)
+
+
+def return_freed_memory() -> None:
+    """Give the system what is free now: after a compilation, whose many small pieces would lie unused below a step's working memory."""
+    _call_glibc("malloc_trim", 0)
+
+
+def _call_glibc(name: str, *arguments: int) -> None:
+    if platform.libc_ver()[0] == "glibc":
+        with contextlib.suppress(OSError, AttributeError):
+            getattr(ctypes.CDLL(None), name)(*arguments)

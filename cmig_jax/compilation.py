@@ -1,11 +1,15 @@
-"""Compiled programs on disk: a run that continues, or another seed of it, starts without compiling again."""
+"""How XLA compiles: kept on disk, so that a run that continues or another seed starts without compiling again; for a CPU, frugally."""
 
 from __future__ import annotations
 
 import os
+from collections.abc import Callable
 from pathlib import Path
+from typing import Any
 
 import jax
+
+from cmig_jax.allocator import return_freed_memory
 
 
 def keep_compiled_programs() -> str:
@@ -13,3 +17,25 @@ def keep_compiled_programs() -> str:
     folder = os.environ.get("JAX_COMPILATION_CACHE_DIR") or str(Path.home() / ".cache" / "cmig_jax" / "compiled")
     jax.config.update("jax_compilation_cache_dir", folder)
     return folder
+
+
+def frugal() -> dict[str, str]:
+    """Return options for `jax.jit` under which a CPU holds about a quarter less: operations in the order that frees memory soonest.
+
+    By default XLA's CPU compiler orders them to run at the same time, which two to sixteen cores do not need: each operation uses all.
+    """
+    return {"xla_cpu_scheduler_type": "CPU_SCHEDULER_TYPE_MEMORY_OPTIMIZED"} if jax.default_backend() == "cpu" else {}
+
+
+def compiled_first(function: Any) -> Callable[..., Any]:
+    """Compile a `jax.jit` function at its first call, for its arguments' shapes alone, and return the compiler's memory before it runs."""
+    program = None
+
+    def call(*arguments: Any) -> Any:
+        nonlocal program
+        if program is None:
+            program = function.lower(*arguments).compile()
+            return_freed_memory()
+        return program(*arguments)
+
+    return call

@@ -224,6 +224,9 @@ class ComputeConfig:
 
     precision: Literal["float32", "bfloat16"] = "float32"
     """Layers' precision; geometry, normalisation statistics and losses stay in float32."""
+    recompute: Literal["off", "on"] = "off"
+    """In training, keep the inputs of each image block, fusion pass and iteration and compute the rest again for the derivative: less
+    memory, more time."""
     rows: int = 0
     """Largest number of rows per chunk of kNN, attention and matching, which bounds memory. 0: kNN and attention whole, matching in
     chunks that suit the machine."""

@@ -16,6 +16,7 @@ from cmig_jax.bench.clock import KEPT, OURS, PYTORCH, Timing, in_turns
 from cmig_jax.bench.clouds import measure_clouds
 from cmig_jax.bench.memory import resident
 from cmig_jax.bench.worker import Worker
+from cmig_jax.config import ComputeConfig
 
 pytest.importorskip("torch")
 
@@ -42,7 +43,7 @@ def test_both_networks_find_the_same_poses():
 
 def test_a_worker_that_fails_is_named():
     with (
-        Worker("tiny", "pytorch", "cpu", 0) as worker,
+        Worker("tiny", "pytorch", "cpu", ComputeConfig()) as worker,
         pytest.raises(RuntimeError, match=r"pytorch \(tiny\) ended with code 1 at 'training x'"),
     ):
         worker("training x")
@@ -81,4 +82,4 @@ def test_memory_is_read_from_the_system():
 
 
 def test_clouds_of_no_size_are_measured_in_no_process():
-    assert measure_clouds(()) == []
+    assert measure_clouds((), ComputeConfig()) == []

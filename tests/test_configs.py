@@ -141,6 +141,7 @@ TABLE = {
     "optim.epochs": (100, None),
     "optim.batch": (6, None),
     "compute.precision": ("float32", None),
+    "compute.recompute": ("off", None),
 }
 
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import json as serialiser
 import sys
 from pathlib import Path
@@ -14,13 +15,16 @@ from cmig_jax.bench.cases import CASES
 from cmig_jax.bench.clouds import measure_clouds
 from cmig_jax.bench.run import run
 from cmig_jax.compilation import keep_compiled_programs
+from cmig_jax.config import ComputeConfig
+
+DEFAULT = ComputeConfig()
 
 
 def main(
     cases: tuple[Literal["paper", "points", "quickstart", "tiny"], ...] = ("paper", "points", "quickstart"),
     device: Literal["cpu", "gpu"] = "cpu",
     repetitions: int = 5,
-    rows: int = 0,
+    compute: ComputeConfig = DEFAULT,
     stages: bool = True,
     memory: bool = True,
     clouds: tuple[int, ...] = (),
@@ -33,26 +37,26 @@ def main(
             encoder, whose result both are given; `quickstart`: the small preset's network and batch; `tiny`: for tests.
         device: where to compute.
         repetitions: of every measurement; medians are reported.
-        rows: `compute.rows` of our network.
+        compute: how our network computes.
         stages: also time every stage alone.
         memory: also take peak memory, in separate processes.
-        clouds: instead, register clouds of these sizes with our network (`--rows` is 512 if not given) and print time and memory.
+        clouds: instead, register clouds of these sizes with our network (`--compute.rows` is 512 if not given) and print time and memory.
         json: file to write the results to.
     """
     if repetitions < 1:
         sys.exit(f"error: --repetitions {repetitions}: expected at least 1")
     if clouds:
-        results: dict[str, Any] = {"clouds": measure_clouds(clouds, rows or 512, device)}
+        results: dict[str, Any] = {"clouds": measure_clouds(clouds, dataclasses.replace(compute, rows=compute.rows or 512), device)}
         print("\n".join(cloud_lines(results["clouds"])))
     else:
         cache = keep_compiled_programs()
         print(f"persistent compilation cache: {cache}")
         results = {}
         for name in cases:
-            results[name] = run(name, repetitions, device, rows, memory, stages)
+            results[name] = run(name, repetitions, device, compute, memory, stages)
             print("\n".join(case_lines(name, results[name])), flush=True)
     if json is not None:
-        header = {"device": device, "repetitions": repetitions, "rows": rows, "jax": jax.__version__}
+        header = {"device": device, "repetitions": repetitions, "compute": dataclasses.asdict(compute), "jax": jax.__version__}
         json.write_text(serialiser.dumps(header | results, indent=1) + "\n")
 
 

@@ -8,10 +8,11 @@ import sys
 from pathlib import Path
 from typing import Any, Literal
 
-from cmig_jax.bench.worker import Who, network_of
+from cmig_jax.bench.worker import Who, arguments, network_of
+from cmig_jax.config import ComputeConfig
 
 
-def measure(case: str, who: Who, what: str, device: str, rows: int) -> dict[str, float]:
+def measure(case: str, who: Who, what: str, device: str, compute: ComputeConfig) -> dict[str, float]:
     """Run one network in a new process.
 
     Args:
@@ -19,13 +20,13 @@ def measure(case: str, who: Who, what: str, device: str, rows: int) -> dict[str,
         who: which network.
         what: `inference` or `training`.
         device: `cpu` or `gpu`.
-        rows: `compute.rows` of ours.
+        compute: how ours computes.
 
     Returns:
         `peak_gb`, the largest resident memory of the process (of the device, on a GPU), and `above_runtime_gb`, without what the process
         held once libraries, weights and inputs were loaded.
     """
-    return in_a_process("cmig_jax.bench.memory", case, who, what, device, str(rows))
+    return in_a_process("cmig_jax.bench.memory", what, *arguments(case, who, device, compute))
 
 
 def in_a_process(module: str, *arguments: str) -> dict[str, Any]:
@@ -43,9 +44,8 @@ def resident(field: Literal["VmHWM", "VmRSS"]) -> int:
     return next((int(line.split()[1]) * 1024 for line in lines if line.startswith(field)), 0)
 
 
-def main(case: str, who: Who, what: str, device: str, rows: int) -> dict[str, float]:
+def main(what: str, network: Any, device: str) -> dict[str, float]:
     """Do it twice in this process; return the peaks."""
-    network = network_of(case, who, device, rows)
     before = resident("VmRSS")
     work = getattr(network, what)()
     work()
@@ -55,5 +55,5 @@ def main(case: str, who: Who, what: str, device: str, rows: int) -> dict[str, fl
 
 
 if __name__ == "__main__":
-    case, who, what, device, rows = sys.argv[1:]
-    print(json.dumps(main(case, who, what, device, int(rows))))  # type: ignore[arg-type]
+    what, case, who, device, compute = sys.argv[1:]
+    print(json.dumps(main(what, network_of(case, who, device, compute), device)))  # type: ignore[arg-type]

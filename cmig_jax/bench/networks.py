@@ -13,11 +13,11 @@ from cmig_jax.parity.twin_bench import TwinBench
 from cmig_jax.parity.twin_run import state_shapes
 
 
-def make_ours(name: str, device: str, rows: int = 0) -> Ours:
+def make_ours(name: str, device: str, compute: ComputeConfig | None = None) -> Ours:
     """Build our network on a case's inputs."""
     keep_compiled_programs()
     jax.config.update("jax_platforms", "cuda" if device == "gpu" else "cpu")
-    return Ours(CASES[name], make_arrays(CASES[name]), ComputeConfig(rows=rows))
+    return Ours(CASES[name], make_arrays(CASES[name]), compute)
 
 
 def make_twin(name: str, device: str) -> TwinBench:

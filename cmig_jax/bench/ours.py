@@ -12,6 +12,7 @@ import jax
 import jax.numpy as jnp
 from jax import Array
 
+from cmig_jax.allocator import return_freed_memory
 from cmig_jax.bench.cases import Arrays, Case
 from cmig_jax.config import ComputeConfig, Config
 from cmig_jax.nn.build import build
@@ -136,6 +137,7 @@ class Ours:
 
     def _note(self, name: str, compiled: Any, start: float) -> None:
         self.compile_seconds[name] = time.perf_counter() - start
+        return_freed_memory()
         cost, memory = compiled.cost_analysis() or {}, compiled.memory_analysis()
         self.costs[name] = {
             "operations": cost.get("flops", 0.0),

@@ -12,16 +12,17 @@ from cmig_jax.bench.cases import CASES
 from cmig_jax.bench.clock import KEPT, OURS, PYTORCH, in_turns
 from cmig_jax.bench.memory import measure
 from cmig_jax.bench.worker import Who, Worker
+from cmig_jax.config import ComputeConfig
 
 
-def run(name: str, repetitions: int, device: str, rows: int, memory: bool, stages: bool) -> dict[str, Any]:
+def run(name: str, repetitions: int, device: str, compute: ComputeConfig, memory: bool, stages: bool) -> dict[str, Any]:
     """Measure a case.
 
     Args:
         name: of the case.
         repetitions: of each measurement; medians are reported.
         device: `cpu` or `gpu`.
-        rows: `compute.rows` of ours.
+        compute: how ours computes.
         memory: also take peak memory.
         stages: also time each stage alone.
 
@@ -29,18 +30,18 @@ def run(name: str, repetitions: int, device: str, rows: int, memory: bool, stage
         `inference` and `training`, each with `whole` and the stages (`Timing.as_json`, and ours' costs), `memory` of a training step,
         `memory_inference`, and `compile_s`.
     """
-    results = _times(name, repetitions, device, rows, stages)
+    results = _times(name, repetitions, device, compute, stages)
     if memory:
-        results |= {"memory": _memory(name, "training", device, rows), "memory_inference": _memory(name, "inference", device, rows)}
+        results |= {"memory": _memory(name, "training", device, compute), "memory_inference": _memory(name, "inference", device, compute)}
     return results
 
 
-def _times(name: str, repetitions: int, device: str, rows: int, stages: bool) -> dict[str, Any]:
+def _times(name: str, repetitions: int, device: str, compute: ComputeConfig, stages: bool) -> dict[str, Any]:
     networks: tuple[Who, ...] = (PYTORCH, KEPT, OURS) if device == "cpu" else (PYTORCH, OURS)
     whats = ["whole", *(CASES[name].stages if stages else ())]
     results: dict[str, Any] = {"inference": {}, "training": {}}
     with contextlib.ExitStack() as stack:
-        workers = {who: stack.enter_context(Worker(name, who, device, rows)) for who in networks}
+        workers = {who: stack.enter_context(Worker(name, who, device, compute)) for who in networks}
         for mode, found in results.items():
             for what in tqdm(whats, desc=f"{name} {mode}", leave=False, disable=None):
                 works = {who: functools.partial(worker, f"{mode} {what}") for who, worker in workers.items()}
@@ -52,8 +53,8 @@ def _times(name: str, repetitions: int, device: str, rows: int, stages: bool) ->
     return results | {"compile_s": {mode: ours["compile_seconds"][mode] for mode in ("inference", "training")}}
 
 
-def _memory(name: str, what: str, device: str, rows: int) -> dict[str, float]:
-    theirs, ours = (measure(name, who, what, device, rows) for who in (PYTORCH, OURS))
+def _memory(name: str, what: str, device: str, compute: ComputeConfig) -> dict[str, float]:
+    theirs, ours = (measure(name, who, what, device, compute) for who in (PYTORCH, OURS))
     return {
         "ratio": theirs["peak_gb"] / ours["peak_gb"],
         "pytorch_gb": theirs["peak_gb"],

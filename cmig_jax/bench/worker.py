@@ -6,6 +6,7 @@ freed memory kept (`cmig_jax.allocator`), as ours always is.
 
 from __future__ import annotations
 
+import dataclasses
 import json
 import os
 import subprocess
@@ -15,6 +16,7 @@ from types import TracebackType
 from typing import Any, Literal
 
 from cmig_jax.allocator import keep_freed_memory
+from cmig_jax.config import ComputeConfig
 
 Who = Literal["pytorch", "pytorch_kept", "ours"]
 COSTS = "costs"
@@ -27,11 +29,11 @@ class Worker:
         case: name of the case.
         who: which network, and how it allocates.
         device: `cpu` or `gpu`.
-        rows: `compute.rows` of ours.
+        compute: how ours computes.
     """
 
-    def __init__(self, case: str, who: Who, device: str, rows: int) -> None:
-        command = [sys.executable, "-m", "cmig_jax.bench.worker", case, who, device, str(rows)]
+    def __init__(self, case: str, who: Who, device: str, compute: ComputeConfig) -> None:
+        command = [sys.executable, "-m", "cmig_jax.bench.worker", *arguments(case, who, device, compute)]
         environment = {**os.environ, "XLA_PYTHON_CLIENT_PREALLOCATE": "false"}  # PyTorch needs its share of a GPU
         self._name = f"{who} ({case})"
         self._process = subprocess.Popen(command, env=environment, stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True, bufsize=1)
@@ -64,18 +66,22 @@ class Worker:
         self._process.communicate()
 
 
-def network_of(case: str, who: Who, device: str, rows: int) -> Any:
-    """Build a network in this process."""
+def arguments(case: str, who: Who, device: str, compute: ComputeConfig) -> list[str]:
+    """Write what `network_of` takes as arguments of a process."""
+    return [case, who, device, json.dumps(dataclasses.asdict(compute))]
+
+
+def network_of(case: str, who: Who, device: str, compute: str) -> Any:
+    """Build a network in this process, as `arguments` names it."""
     if who != "pytorch":
         keep_freed_memory()  # before torch or jax, which are loaded below, start their threads
     from cmig_jax.bench.networks import make_ours, make_twin
 
-    return make_ours(case, device, rows) if who == "ours" else make_twin(case, device)
+    return make_ours(case, device, ComputeConfig(**json.loads(compute))) if who == "ours" else make_twin(case, device)
 
 
-def main(case: str, who: Who, device: str, rows: int) -> None:
+def main(network: Any) -> None:
     """Answer one line of standard input after the other."""
-    network = network_of(case, who, device, rows)
     works: dict[str, Any] = {}
     for line in sys.stdin:
         name = line.strip()
@@ -95,5 +101,4 @@ def main(case: str, who: Who, device: str, rows: int) -> None:
 
 
 if __name__ == "__main__":
-    case, who, device, rows = sys.argv[1:]
-    main(case, who, device, int(rows))  # type: ignore[arg-type]
+    main(network_of(*sys.argv[1:]))  # type: ignore[arg-type]

@@ -19,11 +19,11 @@ def build(config: Config) -> CMIGNet:
     m = config.model
     dim, rows = m.points.dim, config.compute.rows
     dtype = jnp.bfloat16 if config.compute.precision == "bfloat16" else None
-    image = m.fusion.image
+    image, recompute = m.fusion.image, config.compute.recompute == "on"
     return CMIGNet(
         points=PointEncoder(m.points.k, m.points.widths, dim, rows=rows, dtype=dtype),
         heads=tuple(_head(config, dtype) for _ in range(m.matching.iterations)),
-        views=ViewEncoder(m.image.widths, m.image.blocks, dtype=dtype) if uses_images(config) else None,
+        views=ViewEncoder(m.image.widths, m.image.blocks, recompute, dtype) if uses_images(config) else None,
         transformer=(
             PairTransformer(dim, m.fusion.heads, m.fusion.feed_forward, rows=rows, dtype=dtype)
             if m.fusion.points == "transformer"
@@ -41,6 +41,7 @@ def build(config: Config) -> CMIGNet:
         correspondence=m.matching.correspondence,
         centroid=m.pose.centroid,
         pose_gradient=m.pose.gradient,
+        recompute=recompute,
         rows=rows,
     )
 

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
-from typing import Literal
+from typing import Any, Literal
 
 import chex
 import flax.linen as nn
@@ -18,6 +18,7 @@ from cmig_jax.nn.edgeconv import PointEncoder
 from cmig_jax.nn.fusion import CrossAttention
 from cmig_jax.nn.keypoints import SignificanceScore, draw_for_training, pair_in_order, random_points, top_scores, true_correspondents
 from cmig_jax.nn.matching import CMIGNetHead, IDAMHead, KeypointSet, Match, PCRNetHead
+from cmig_jax.nn.recompute import applied
 from cmig_jax.nn.resnet import ViewEncoder
 from cmig_jax.structs import Batch, Iteration, Keypoints, Prediction, RigidTransform
 
@@ -41,6 +42,7 @@ class CMIGNet(nn.Module):
         test_keypoints: K in evaluation, at most all points; 0 is `keypoints`.
         correspondence: a source keypoint's partner is the `hard` best target keypoint, or the `soft` mean of all under the softmax of M.
         repeats: iterations in evaluation beyond those trained, with the weights of the last.
+        recompute: whether fusion passes and iterations are computed again for the derivative instead of kept.
     """
 
     points: PointEncoder
@@ -59,6 +61,7 @@ class CMIGNet(nn.Module):
     correspondence: Literal["hard", "soft"] = "hard"
     centroid: Literal["weighted", "unweighted"] = "weighted"
     pose_gradient: Literal["stopped", "through"] = "stopped"
+    recompute: bool = False
     rows: int = 0
 
     @nn.compact
@@ -132,7 +135,7 @@ class CMIGNet(nn.Module):
     def _fuse(self, source: Array, target: Array, tokens: Array | None) -> tuple[Array, Array]:
         """Let the clouds see each other, then the images (Sec. III-C); each layer adds to the features."""
         if self.transformer is not None:
-            source, target = source + self.transformer(source, target), target + self.transformer(target, source)
+            source, target = source + self._layer(self.transformer, source, target), target + self._layer(self.transformer, target, source)
         if self.image_fusion == "none" or tokens is None:
             return source, target
         if self.image_fusion != "views":
@@ -140,7 +143,10 @@ class CMIGNet(nn.Module):
         of_source, of_target = tokens[:, 0].astype(source.dtype), tokens[:, -1].astype(source.dtype)
         layer = self.transformer if self.image_fusion == "transformer" else self.cross_attention
         assert layer is not None
-        return source + layer(source, of_source), target + layer(target, of_target)
+        return source + self._layer(layer, source, of_source), target + self._layer(layer, target, of_target)
+
+    def _layer(self, module: nn.Module, *inputs: Any, **flags: Any) -> Any:
+        return applied(module, *inputs, recompute=self.recompute, **flags)
 
     def _scores(self, source: Array, target: Array) -> tuple[Array | None, Array | None]:
         """Score the points that each cloud's keypoints are picked by (Sec. III-D)."""
@@ -181,7 +187,7 @@ class CMIGNet(nn.Module):
             if isinstance(head, PCRNetHead):
                 iteration = Iteration(source=source.points, step=head(source, target))
             else:
-                iteration = self._solve(head(source, target, train=train), source, target)
+                iteration = self._solve(self._layer(head, source, target, train=train), source, target)
             iterations.append(iteration)
             source = dataclasses.replace(source, points=iteration.step.apply(source.points))
             pose = iteration.step.compose(pose)

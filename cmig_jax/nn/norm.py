@@ -33,8 +33,7 @@ class Affine:
 
     def __call__(self, x: Array) -> Array:
         """Normalise `x [..., C]`; the result has the type of `x`."""
-        mean, scale, bias = (channels(v, x.ndim) for v in (self.mean, self.scale, self.bias))
-        return ((x - mean) * scale + bias).astype(x.dtype)
+        return (_scaled(x, self.mean, self.scale) + channels(self.bias, x.ndim)).astype(x.dtype)
 
 
 def channels(vector: Array, ndim: int) -> Array:
@@ -47,8 +46,43 @@ def moments(parts: Sequence[Array]) -> Moments:
     wide = [part.astype(jnp.promote_types(part.dtype, jnp.float32)) for part in parts]
     count = sum(part.size // part.shape[-1] for part in wide)
     mean = _total(_sum(part) for part in wide) / count
-    variance = _total(_sum((part - channels(mean, part.ndim)) ** 2) for part in wide) / count
+    variance = _total(_squares(part, mean) for part in wide) / count
     return Moments(mean=mean, variance=variance, count=count)
+
+
+# What follows is differentiated by hand, so that only `x` is kept for it and not also `x - mean`. The derivatives say `mean - x`
+# because XLA would find that `x - mean` has been computed before, and keep it.
+
+
+@jax.custom_vjp
+def _scaled(x: Array, mean: Array, scale: Array) -> Array:
+    """Return `(x - mean) * scale` for `x [..., C]`."""
+    return (x - channels(mean, x.ndim)) * channels(scale, x.ndim)
+
+
+def _scaled_backward(saved: tuple[Array, Array, Array], gradient: Array) -> tuple[Array, Array, Array]:
+    x, mean, scale = saved
+    of_x = gradient * channels(scale, x.ndim)
+    of_scale = -_sum(gradient * (channels(mean, x.ndim) - x))
+    return of_x.astype(x.dtype), -_sum(gradient) * scale, of_scale
+
+
+_scaled.defvjp(lambda x, mean, scale: (_scaled(x, mean, scale), (x, mean, scale)), _scaled_backward)
+
+
+@jax.custom_vjp
+def _squares(x: Array, mean: Array) -> Array:
+    """Sum `(x - mean) ** 2` over everything but the channels."""
+    return _sum((x - channels(mean, x.ndim)) ** 2)
+
+
+def _squares_backward(saved: tuple[Array, Array], gradient: Array) -> tuple[Array, Array]:
+    x, mean = saved
+    of_mean = 2 * channels(gradient, x.ndim) * (channels(mean, x.ndim) - x)
+    return -of_mean, _sum(of_mean)
+
+
+_squares.defvjp(lambda x, mean: (_squares(x, mean), (x, mean)), _squares_backward)
 
 
 def _total(parts: Iterable[Array]) -> Array:

@@ -15,6 +15,7 @@ from jax import Array
 from cmig_jax.nn.convolution import Convolution, convolve, he_fan_out
 from cmig_jax.nn.norm import BatchNorm
 from cmig_jax.nn.pooling import max_pool
+from cmig_jax.nn.recompute import applied
 
 IMAGENET_MEAN = (0.485, 0.456, 0.406)
 IMAGENET_STD = (0.229, 0.224, 0.225)
@@ -25,18 +26,20 @@ class ViewEncoder(nn.Module):
 
     widths: tuple[int, ...] = (64, 128, 256, 512)
     blocks: tuple[int, ...] = (2, 2, 2, 2)
+    recompute: bool = False
     dtype: jnp.dtype | None = None
 
     @nn.compact
     def __call__(self, views: Array, *, train: bool) -> Array:
         """Encode views `[..., H, W, 1]` (uint8 depth) or `[..., H, W, 3]` (normalised RGB) to `[..., widths[-1]]`."""
         x = Stem(self.widths[0], dtype=self.dtype, name="stem")(views.reshape(-1, *views.shape[-3:]))
-        x = nn.relu(BatchNorm(self.widths[0], name="stem_norm")(x, train=train))
-        x = max_pool(x)
+        # The ReLU after the maximum: the same numbers, a quarter of them.
+        x = nn.relu(max_pool(BatchNorm(self.widths[0], name="stem_norm")(x, train=train)))
         for stage, (width, count) in enumerate(zip(self.widths, self.blocks, strict=True)):
             for block in range(count):
                 stride = 2 if stage > 0 and block == 0 else 1
-                x = BasicBlock(width, stride, dtype=self.dtype, name=f"stage_{stage}_block_{block}")(x, train=train)
+                module = BasicBlock(width, stride, dtype=self.dtype, name=f"stage_{stage}_block_{block}")
+                x = applied(module, x, recompute=self.recompute, train=train)
         pooled = jnp.mean(x.astype(jnp.promote_types(x.dtype, jnp.float32)), axis=(1, 2))
         return pooled.reshape(*views.shape[:-3], -1)
 

@@ -16,6 +16,7 @@ import jax
 import numpy as np
 from jax.sharding import Mesh
 
+from cmig_jax.compilation import compiled_first
 from cmig_jax.config import Config
 from cmig_jax.data.loader import BatchIterator, epoch_steps, training_batches
 from cmig_jax.data.pairs import Pair, Pairs, in_categories, split_validation
@@ -111,7 +112,7 @@ class _Run:
             self.state = restored[0]
             self.batches.set_state(restored[1])
         self.step = int(self.state.step)
-        self.update: Step = make_step(model, rule, config, self.mesh)
+        self.update: Step = compiled_first(make_step(model, rule, config, self.mesh))
         self.key = jax.random.key(config.seed)
         self.predictor = Predictor(model, config.optim.batch, self.mesh)
         self.vote = StopVote(self.mesh)

@@ -12,6 +12,7 @@ from flax import struct
 from jax import Array
 from jax.sharding import Mesh
 
+from cmig_jax.compilation import frugal
 from cmig_jax.config import Config
 from cmig_jax.losses import losses
 from cmig_jax.nn.cmignet import CMIGNet
@@ -103,4 +104,5 @@ def make_step(model: CMIGNet, optimizer: optax.GradientTransformation, config: C
         kept = jax.tree.map(lambda new, old: jnp.where(finite, new, old), changed, state)
         return kept.replace(step=state.step + 1), {"loss": loss, **terms, "gradient_norm": norm}
 
-    return jax.jit(step, donate_argnums=0, in_shardings=(replicated(mesh), split(mesh), None), out_shardings=replicated(mesh))
+    shardings = {"in_shardings": (replicated(mesh), split(mesh), None), "out_shardings": replicated(mesh)}
+    return jax.jit(step, donate_argnums=0, compiler_options=frugal(), **shardings)

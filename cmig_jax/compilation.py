@@ -20,9 +20,9 @@ def keep_compiled_programs() -> str:
 
 
 def frugal() -> dict[str, str]:
-    """Return options for `jax.jit` under which a CPU holds about a quarter less: operations in the order that frees memory soonest.
+    """Return options for `jax.jit` under which a CPU holds less: operations in the order that frees memory soonest.
 
-    By default XLA's CPU compiler orders them to run at the same time, which two to sixteen cores do not need: each operation uses all.
+    By default XLA orders them so that several can run at the same time; here each of the large ones takes all cores by itself.
     """
     return {"xla_cpu_scheduler_type": "CPU_SCHEDULER_TYPE_MEMORY_OPTIMIZED"} if jax.default_backend() == "cpu" else {}
 

@@ -9,22 +9,29 @@ import pytest
 PROGRAM = """
 import resource
 import numpy as np
-from cmig_jax.allocator import keep_freed_memory
+from cmig_jax.allocator import keep_freed_memory, return_freed_memory
 {call}
 def faults():
     before = resource.getrusage(resource.RUSAGE_SELF).ru_minflt
     np.ones(64 * 2**17)
     return resource.getrusage(resource.RUSAGE_SELF).ru_minflt - before
 faults()
+{between}
 print(faults())
 """
 
 
-def second_time(call: str) -> int:
+def second_time(call: str, between: str = "") -> int:
     """Count the pages that a process is given when it takes 64 MB for the second time."""
-    return int(subprocess.run([sys.executable, "-c", PROGRAM.format(call=call)], capture_output=True, text=True, check=True).stdout)
+    program = PROGRAM.format(call=call, between=between)
+    return int(subprocess.run([sys.executable, "-c", program], capture_output=True, text=True, check=True).stdout)
 
 
 @pytest.mark.skipif(platform.libc_ver()[0] != "glibc", reason="a setting of glibc")
 def test_memory_is_taken_from_the_system_once():
     assert second_time("keep_freed_memory()") < 10 < second_time("")
+
+
+@pytest.mark.skipif(platform.libc_ver()[0] != "glibc", reason="a setting of glibc")
+def test_memory_that_is_kept_can_be_returned():
+    assert second_time("keep_freed_memory()", between="return_freed_memory()") > 10

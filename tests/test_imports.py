@@ -23,7 +23,7 @@ TOP = {
 }
 BELOW = {
     "allocator": set(),
-    "compilation": set(),
+    "compilation": {"allocator"},
     "config": set(),
     "structs": set(),
     "data": {"config"},
@@ -32,7 +32,7 @@ BELOW = {
     "losses": {"structs", "geometry", "config"},
     "metrics": {"structs", "geometry"},
     "weights": {"config"},
-    "training": {"config", "structs", "data", "geometry", "nn", "losses", "metrics"},
+    "training": {"compilation", "config", "structs", "data", "geometry", "nn", "losses", "metrics"},
 }
 EVERYTHING = set(BELOW) | TOP
 FORBIDDEN = {"config": {"jax", "flax"}, "data": {"jax", "flax"}, "geometry": {"flax"}}

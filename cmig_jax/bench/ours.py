@@ -14,7 +14,6 @@ from jax import Array
 
 from cmig_jax.allocator import return_freed_memory
 from cmig_jax.bench.cases import Arrays, Case
-from cmig_jax.compilation import frugal
 from cmig_jax.config import ComputeConfig, Config
 from cmig_jax.nn.build import build
 from cmig_jax.nn.cmignet import CMIGNet, _gather
@@ -76,7 +75,7 @@ class Ours:
             return prediction.target_from_source
 
         inputs = (self.variables, replace(self.batch, target_from_source=None))
-        return self._compiled("inference", jax.jit(poses, compiler_options=frugal()), inputs)
+        return self._compiled("inference", jax.jit(poses), inputs)
 
     def training(self) -> Work:
         """Compile the training step; each call takes one."""

@@ -9,7 +9,6 @@ import jax
 import numpy as np
 from jax.sharding import Mesh
 
-from cmig_jax.compilation import frugal
 from cmig_jax.data.loader import stack
 from cmig_jax.data.pairs import Pair
 from cmig_jax.nn.cmignet import CMIGNet
@@ -41,11 +40,11 @@ class Predictor:
             with sharing(mesh):
                 return apply(variables, inputs).target_from_source, inputs.target_from_source
 
-        self.apply = jax.jit(apply, compiler_options=frugal())
+        self.apply = jax.jit(apply)
         shardings: dict[str, Any] = {}
         if mesh is not None:
             shardings = {"in_shardings": (replicated(mesh), split(mesh)), "out_shardings": replicated(mesh)}
-        self._poses = jax.jit(poses, compiler_options=frugal(), **shardings)
+        self._poses = jax.jit(poses, **shardings)
 
     def __call__(self, variables: Mapping[str, Any], pairs: Sequence[Pair]) -> Poses:
         """Return R `[n, 3, 3]` and t `[n, 3]`, target_from_source, of pairs of equal shapes."""

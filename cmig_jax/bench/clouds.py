@@ -5,7 +5,7 @@ from __future__ import annotations
 import json
 import sys
 import time
-from dataclasses import replace
+from dataclasses import asdict, replace
 from typing import Any
 
 import jax
@@ -14,22 +14,21 @@ from cmig_jax.allocator import keep_freed_memory
 from cmig_jax.bench.cases import CASES, make_arrays
 from cmig_jax.bench.memory import in_a_process, resident
 from cmig_jax.bench.ours import Ours
-from cmig_jax.bench.worker import arguments
 from cmig_jax.compilation import keep_compiled_programs
 from cmig_jax.config import ComputeConfig
 
 
 def measure_clouds(sizes: tuple[int, ...], compute: ComputeConfig, device: str = "cpu") -> list[dict[str, Any]]:
     """Measure each size: `points`, `seconds`, `peak_gb`, `above_runtime_gb`, `compile_s`."""
-    return [in_a_process("cmig_jax.bench.clouds", str(N), *arguments("points", "ours", device, compute)) for N in sizes]
+    return [in_a_process("cmig_jax.bench.clouds", str(N), device, json.dumps(asdict(compute))) for N in sizes]
 
 
-def main(points: int, name: str, device: str, compute: ComputeConfig) -> dict[str, float]:
+def main(points: int, device: str, compute: ComputeConfig) -> dict[str, float]:
     """Register one pair of clouds with the paper's network, the image encoder's result given."""
     keep_freed_memory()
     keep_compiled_programs()
     jax.config.update("jax_platforms", "cuda" if device == "gpu" else "cpu")
-    case = replace(CASES[name], pairs=1, points=points)
+    case = replace(CASES["points"], pairs=1, points=points)
     network = Ours(case, make_arrays(case), compute)
     before = resident("VmRSS")
     work = network.inference()
@@ -48,5 +47,5 @@ def main(points: int, name: str, device: str, compute: ComputeConfig) -> dict[st
 
 
 if __name__ == "__main__":
-    points, name, _, device, compute = sys.argv[1:]
-    print(json.dumps(main(int(points), name, device, ComputeConfig(**json.loads(compute)))))
+    points, device, compute = sys.argv[1:]
+    print(json.dumps(main(int(points), device, ComputeConfig(**json.loads(compute)))))

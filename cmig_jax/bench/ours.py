@@ -74,8 +74,7 @@ class Ours:
             assert isinstance(prediction, Prediction)
             return prediction.target_from_source
 
-        inputs = (self.variables, replace(self.batch, target_from_source=None))
-        return self._compiled("inference", jax.jit(poses), inputs)
+        return self._compiled("inference", jax.jit(poses), (self.variables, replace(self.batch, target_from_source=None)))
 
     def training(self) -> Work:
         """Compile the training step; each call takes one."""

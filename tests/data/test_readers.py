@@ -1,7 +1,6 @@
 """Readers give every object of a source, and name the file, the value and what was expected where they cannot."""
 
 import json
-import os
 import pickle
 from pathlib import Path
 
@@ -18,15 +17,6 @@ from cmig_jax.data.readers import open_raw
 from cmig_jax.data.stanford import read_scans
 
 _RNG = np.random.default_rng(0)
-
-
-def _shared(name: str) -> Path:
-    """Real data, on machines that have it."""
-    base = Path(os.environ.get("CMIG_SHARED", Path(__file__).resolve().parents[2] / "../shared"))
-    for path in (base / "data" / name, base / name):
-        if path.is_dir():
-            return path
-    pytest.skip(f"needs {name}")
 
 
 def _open(source, root=None, **flags):
@@ -143,8 +133,8 @@ def test_a_damaged_hdf5_folder_is_an_error(hdf5):
         _open("modelnet40-hdf5", hdf5)
 
 
-def test_real_hdf5_objects():
-    dataset = _open("modelnet40-hdf5", _shared("objects_hdf5_2048"))
+def test_real_hdf5_objects(real_data):
+    dataset = _open("modelnet40-hdf5", real_data("objects_hdf5_2048"))
     assert len(dataset.categories) == 40
     assert (_count(dataset, "train"), _count(dataset, "test")) == (2352, 587)
     assert {item.label for item in dataset.objects} == set(range(40))
@@ -348,8 +338,8 @@ def test_a_bad_conf_is_an_error(tmp_path, line, message):
 _FEW = (["bun000.ply"], ["bun045.ply"], ["bun315.ply"])
 
 
-def test_real_scans_of_the_bunny_fit(tmp_path):
-    folder = _shared("stanford_bunny_scans")
+def test_real_scans_of_the_bunny_fit(tmp_path, real_data):
+    folder = real_data("stanford_bunny_scans")
     lines = [line.split() for line in (folder / "bun.conf").read_text().splitlines()]
     few = [f"bmesh {folder / words[1]} {' '.join(words[2:])}" for words in lines if words[1:2] in _FEW]
     (tmp_path / "few.conf").write_text("\n".join(few))
@@ -452,9 +442,9 @@ def test_a_bad_frame_is_an_error(tmp_path, spoil, message):
         _open("sevenscenes", tmp_path / "plane").objects[0].geometry()
 
 
-def test_real_fragments_of_the_kitchen_meet(tmp_path):
+def test_real_fragments_of_the_kitchen_meet(tmp_path, real_data):
     # Every tenth frame keeps the test short; the links keep fragment 0 to frames 0-49 and put fragment 1 in frame 50.
-    folder = _shared("sevenscenes_redkitchen")
+    folder = real_data("sevenscenes_redkitchen")
     for part, frames in (("a", range(0, 50, 10)), ("b", range(50, 100, 10))):
         (tmp_path / part).mkdir()
         for number in frames:

@@ -1,6 +1,5 @@
 """Recorded pairs: what overlaps, the transform between, and what a network is given of them."""
 
-import os
 from dataclasses import replace
 from pathlib import Path
 
@@ -258,17 +257,8 @@ def test_fragments_without_poses_are_refused(tmp_path):
         open_recordings(DataConfig(source="sevenscenes-fragments", root=str(tmp_path)))
 
 
-def shared(name: str) -> Path:
-    """Real data, on machines that have it."""
-    base = Path(os.environ.get("CMIG_SHARED", Path(__file__).resolve().parents[2] / "../shared"))
-    for path in (base / "data" / name, base / name):
-        if path.is_dir():
-            return path
-    pytest.skip(f"needs {name}")
-
-
-def test_the_kitchen_s_transform_is_the_official_one():
-    recorded = open_recordings(DataConfig(source="sevenscenes-fragments", root=str(shared("sevenscenes_redkitchen"))))
+def test_the_kitchen_s_transform_is_the_official_one(real_data):
+    recorded = open_recordings(DataConfig(source="sevenscenes-fragments", root=str(real_data("sevenscenes_redkitchen"))))
     zero, one = (item.world_from_sensor for item in recorded.recordings)
     zero_from_one = [
         [0.996926560, 0.0668735757, -0.0406664421, -0.115576939],
@@ -280,8 +270,8 @@ def test_the_kitchen_s_transform_is_the_official_one():
     assert recorded.candidates == ((0, 1),)
 
 
-def test_two_scans_of_the_bunny_make_two_pairs(tmp_path):
-    folder = shared("stanford_bunny_scans")
+def test_two_scans_of_the_bunny_make_two_pairs(tmp_path, real_data):
+    folder = real_data("stanford_bunny_scans")
     lines = [line.split() for line in (folder / "bun.conf").read_text().splitlines()]
     few = [f"bmesh {folder / words[1]} {' '.join(words[2:])}" for words in lines if words[1:2] in (["bun000.ply"], ["bun045.ply"])]
     (tmp_path / "bunny.conf").write_text("\n".join(few))

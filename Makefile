@@ -31,7 +31,7 @@ lint: $(VENV)/.installed-dev
 	$(BIN)/pyright
 
 test: lint
-	$(BIN)/python -m pytest -n $(JOBS)
+	$(BIN)/python -m pytest -n $(JOBS) --dist worksteal
 
 # An interrupted training goes on where it stopped; a finished one is only evaluated.
 demo: $(VENV)/.installed

@@ -1,4 +1,4 @@
-"""Eight virtual CPU devices, set before jax starts; rank promotion is an error. And a network, clouds and a run that take seconds."""
+"""Eight virtual CPU devices, programs compiled in haste, rank promotion an error. And a network, clouds and a run that take seconds."""
 
 import dataclasses
 import importlib.util
@@ -12,7 +12,7 @@ import h5py
 import numpy as np
 import pytest
 
-os.environ["XLA_FLAGS"] = os.environ.get("XLA_FLAGS", "") + " --xla_force_host_platform_device_count=8"
+os.environ["XLA_FLAGS"] = os.environ.get("XLA_FLAGS", "") + " --xla_force_host_platform_device_count=8 --xla_backend_optimization_level=1"
 os.environ["JAX_PLATFORMS"] = "cpu"
 import jax
 

@@ -12,7 +12,7 @@ from flax import struct
 from jax import Array
 from jax.sharding import Mesh
 
-from cmig_jax.compilation import frugal
+from cmig_jax.compilation import briefly, frugal
 from cmig_jax.config import Config
 from cmig_jax.losses import losses
 from cmig_jax.nn.cmignet import CMIGNet
@@ -43,7 +43,7 @@ class TrainState:
 def create_state(model: CMIGNet, optimizer: optax.GradientTransformation, config: Config, mesh: Mesh) -> TrainState:
     """Initialise a state on every device of the mesh."""
     # Under jit with the sharding of the result: a device_put could alias arrays that the step donates.
-    create = jax.jit(lambda key: _initial(model, optimizer, config, key), out_shardings=replicated(mesh))
+    create = jax.jit(lambda key: _initial(model, optimizer, config, key), out_shardings=replicated(mesh), compiler_options=briefly())
     return create(jax.random.key(config.seed))
 
 

@@ -1,5 +1,6 @@
 """Every row's training step and prediction, traced at toy size: shapes and flags fit each other before hours are spent on them."""
 
+import functools
 from pathlib import Path
 
 import jax
@@ -30,6 +31,7 @@ def distinct(*, tested):
 TRAININGS, TESTS = distinct(tested=False), distinct(tested=True)
 
 
+@functools.cache
 def described(config):
     """Describe the mesh, the state and the smallest batch of a training."""
     mesh, rule = device_mesh(1), optimizer(config.optim, 1)

@@ -1,5 +1,5 @@
-"""Experiments from their command to their table, at toy size. A table and one of recorded pairs are run each time; the others, a
-compilation or two for each row, by `pytest -m slow tests/experiments`. `test_plan.py` has every row as a config and a training step."""
+"""Experiments from their command to their table, at toy size. A table is run each time, and one of its networks on recorded pairs; all
+others, a compilation or two for each row, by `pytest -m slow tests/experiments`. `test_rows.py` traces every row each time."""
 
 import json
 import shutil
@@ -10,7 +10,7 @@ import pytest
 
 from cmig_jax.data.pairs import SYMMETRIC
 from cmig_jax.experiments.__main__ import main
-from configs.experiments import EXPERIMENTS
+from configs.experiments import EXPERIMENTS, NOISE, OBSERVED, Experiment, Row
 
 CATEGORIES = (*SYMMETRIC, "chair", "desk", "door", "sofa")
 
@@ -29,25 +29,29 @@ def objects(tmp_path_factory):
     return root
 
 
-@pytest.fixture
-def run(objects, scans, scenes, tmp_path, monkeypatch):
-    """Run experiments with their data in a folder of the test's own."""
-    monkeypatch.chdir(tmp_path)  # prepared data goes to data/
+@pytest.fixture(scope="session")
+def run(objects, scans, scenes):
+    """Run experiments with their data, and all they write, in a folder; return the exit code."""
 
-    def call(*arguments):
-        places = ("--data", objects, "--stanford", scans, "--sevenscenes", scenes, "--runs", tmp_path / "runs")
-        return main(["run", *map(str, arguments), "--scale", "toy", *map(str, places)])
+    def call(folder, *arguments):
+        places = ("--data", objects, "--stanford", scans, "--sevenscenes", scenes, "--runs", folder / "runs")
+        with pytest.MonkeyPatch.context() as patch:
+            patch.chdir(folder)  # prepared data goes to data/
+            return main(["run", *map(str, arguments), "--scale", "toy", *map(str, places)])
 
     return call
 
 
-QUICK = ("table8", "scans")
+@pytest.fixture(scope="module")
+def table8(run, tmp_path_factory):
+    """The folder in which Table 8 was run."""
+    folder = tmp_path_factory.mktemp("table8")
+    assert run(folder, "table8", "--limit", 3) == 0
+    return folder
 
 
-@pytest.mark.parametrize("name", [*QUICK, *(pytest.param(name, marks=pytest.mark.slow) for name in EXPERIMENTS if name not in QUICK)])
-def test_an_experiment_runs_from_end_to_end(name, run, tmp_path, capsys):
-    assert run(name, "--limit", 4) == 0, capsys.readouterr().out
-    results = json.loads((tmp_path / "runs" / "toy" / f"{name}.json").read_text())
+def assert_complete(name, folder):
+    results = json.loads((folder / "runs" / "toy" / f"{name}.json").read_text())
     assert [row["label"] for row in results["rows"]] == [row.label for row in EXPERIMENTS[name].rows]
     for row in results["rows"]:
         (outcome,) = row["runs"]
@@ -56,17 +60,38 @@ def test_an_experiment_runs_from_end_to_end(name, run, tmp_path, capsys):
         assert outcome["metrics"]["pairs"] <= 4
     assert bool(results["baselines"]) == EXPERIMENTS[name].baselines
     for suffix in ("txt", "md", "tex", "png"):
-        assert (tmp_path / "runs" / "toy" / f"{name}.{suffix}").stat().st_size > 0
+        assert (folder / "runs" / "toy" / f"{name}.{suffix}").stat().st_size > 0
 
 
-def test_what_is_finished_is_not_done_again_and_what_is_missing_is(run, tmp_path, capsys):
-    assert run("table8", "--limit", 3) == 0
+def test_a_table_runs_from_end_to_end(table8):
+    assert_complete("table8", table8)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("name", [name for name in EXPERIMENTS if name != "table8"])
+def test_an_experiment_runs_from_end_to_end(name, run, tmp_path, capsys):
+    assert run(tmp_path, name, "--limit", 4) == 0, capsys.readouterr().out
+    assert_complete(name, tmp_path)
+
+
+def test_recorded_pairs_and_methods_without_learning_by_a_network_that_another_table_trained(table8, run, monkeypatch, capsys):
+    regression, test = {"model.matching.head": "pcrnet"}, {"data.source": "stanford-scans"} | OBSERVED
+    rows = (Row("PCRNet", "paper", regression, test), Row("PCRNet, then ICP", "paper", regression, test, then_icp=True))
+    monkeypatch.setitem(EXPERIMENTS, "recorded", Experiment("range scans", NOISE, rows, baselines=True))
+    logs = {path: path.read_bytes() for path in table8.glob("runs/toy/*/log.jsonl")}
+    assert run(table8, "recorded", "--limit", 4) == 0, capsys.readouterr().out
+    assert_complete("recorded", table8)
+    assert {path: path.read_bytes() for path in table8.glob("runs/toy/*/log.jsonl")} == logs
+
+
+def test_what_is_finished_is_not_done_again_and_what_is_missing_is(table8, run, tmp_path, capsys):
+    shutil.copytree(table8, tmp_path, dirs_exist_ok=True)
     folder = tmp_path / "runs" / "toy"
     logs = {path: path.read_bytes() for path in folder.glob("*/log.jsonl")}
     first = json.loads((folder / "table8.json").read_text())
     lost = next(path.parent for path in logs if "pcrnet" in str(path))
     shutil.rmtree(lost)
-    assert run("table8", "--limit", 3) == 0
+    assert run(tmp_path, "table8", "--limit", 3) == 0
     again = json.loads((folder / "table8.json").read_text())
     for before, after in zip(first["rows"], again["rows"], strict=True):
         expected, found = before["runs"][0]["metrics"], after["runs"][0]["metrics"]
@@ -78,7 +103,7 @@ def test_what_is_finished_is_not_done_again_and_what_is_missing_is(run, tmp_path
         assert path.exists()
         assert path.parent == lost or path.read_bytes() == text
     capsys.readouterr()
-    assert run("table8", "--limit", 3, "--only-collect") == 0
+    assert run(tmp_path, "table8", "--limit", 3, "--only-collect") == 0
     assert "not run" not in capsys.readouterr().out
     assert json.loads((folder / "table8.json").read_text())["rows"] == again["rows"]
 

@@ -64,7 +64,7 @@ def two_processes(small, flags, tmp_path_factory):
     with socket.socket() as free:
         free.bind(("127.0.0.1", 0))
         port = free.getsockname()[1]
-    environment = {**os.environ, "PYTHONPATH": str(ROOT), "XLA_FLAGS": "", "JAX_PLATFORMS": "cpu"}
+    environment = {**os.environ, "PYTHONPATH": str(ROOT), "XLA_FLAGS": "--xla_backend_optimization_level=1", "JAX_PLATFORMS": "cpu"}
     script = [sys.executable, str(ROOT / "tests/training/two_processes.py")]
     arguments = [str(port), str(run), str(stopped), "quickstart", *flags(small), "--runs", str(runs)]
     options = {"cwd": runs, "env": environment, "stdout": subprocess.PIPE, "stderr": subprocess.PIPE, "text": True}

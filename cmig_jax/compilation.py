@@ -28,7 +28,7 @@ def frugal() -> dict[str, str]:
 
 
 def briefly() -> dict[str, int]:
-    """Return options for `jax.jit` of what runs once: compiled in a third of the time, to code that is not optimised."""
+    """Return options for `jax.jit` of what runs once: compiled in about half the time, to code that is not optimised."""
     return {"xla_backend_optimization_level": 0}
 
 

@@ -7,9 +7,12 @@ it, which `--help` shows. Nothing here imports anything of ours, so numpy-only c
 from __future__ import annotations
 
 import dataclasses
+import itertools
 import json
+import math
 from collections.abc import Mapping
 from dataclasses import dataclass, field
+from pathlib import Path
 from typing import Any, Literal, get_args, get_origin, get_type_hints
 
 Categories = Literal["all", "first-half", "second-half"]
@@ -52,6 +55,8 @@ class DataConfig:
     """Largest absolute noise, in object units (Sec. IV-B)."""
     max_angle_deg: float = 45.0
     """Each of the three Euler angles is uniform in [0, this], degrees (Sec. IV-B)."""
+    turn: Literal["positive", "either"] = "positive"
+    """`positive`: angles as above; `either`: in [-max_angle_deg, max_angle_deg], since clouds in the wild turn to either side."""
     max_translation: float = 0.5
     """Each translation component is uniform in [-this, this], object units (Sec. IV-B)."""
     validation: float = 0.1
@@ -119,7 +124,8 @@ class KeypointsConfig:
     """Mask prediction (Sec. III-D; MP of Table 6)."""
 
     select: Literal["predicted", "random", "all"] = "predicted"
-    """Keypoints at evaluation: highest scores, random points, or every point."""
+    """Keypoints: those of the highest scores (in training drawn beside them, so that the scores are learned), random points, or every
+    point. A network trained without scores has none to choose by."""
     count: int = 256
     """Keypoints K per cloud."""
     test_count: int = 0
@@ -260,11 +266,12 @@ def _rules(c: Config) -> list[tuple[str, bool, str]]:
     fixed_count = {"dodecahedron": 20, "axes": 6}.get(v.layout, v.count)
     uses_views = m.fusion.image != "none" or c.loss.cross_modal != "off"
     return [
+        (f"name = {c.name}", is_inside(c.name), "the name of a folder under runs/"),
         (f"data.points = {d.points}", d.points >= 1, "at least 1"),
         (f"data.keep = {d.keep}", 0 < d.keep <= 1, "a share in (0, 1]"),
-        (f"data.noise_std = {d.noise_std}", d.noise_std >= 0, "0 or more"),
+        (f"data.noise_std = {d.noise_std}", 0 <= d.noise_std < math.inf, "0 or more"),
         (f"data.noise_clip = {d.noise_clip}", d.noise_clip >= 0, "0 or more"),
-        (f"data.max_translation = {d.max_translation}", d.max_translation >= 0, "0 or more"),
+        (f"data.max_translation = {d.max_translation}", 0 <= d.max_translation < math.inf, "0 or more"),
         (f"data.test_seed = {d.test_seed}", d.test_seed >= 0, "0 or more"),
         (f"data.workers = {d.workers}", d.workers >= 0, "0 or more"),
         (f"seed = {c.seed}", c.seed >= 0, "0 or more"),
@@ -326,12 +333,23 @@ def _rules(c: Config) -> list[tuple[str, bool, str]]:
         ),
         (f"optim.epochs = {o.epochs}", o.epochs >= 1, "at least 1"),
         (f"optim.validate_every = {o.validate_every}", o.validate_every >= 1, "at least 1"),
-        (f"optim.learning_rate = {o.learning_rate}", o.learning_rate > 0, "above 0"),
-        (f"optim.weight_decay = {o.weight_decay}", o.weight_decay >= 0, "0 or more"),
+        (f"optim.learning_rate = {o.learning_rate}", 0 < o.learning_rate < math.inf, "above 0"),
+        (f"optim.weight_decay = {o.weight_decay}", 0 <= o.weight_decay < math.inf, "0 or more"),
+        (
+            f"optim.milestones = {o.milestones}",
+            all(a < b for a, b in itertools.pairwise((0, *o.milestones))),
+            "epochs above 0, each later than the one before",
+        ),
         (f"optim.decay = {o.decay}", 0 < o.decay <= 1, "a factor in (0, 1]"),
         (f"optim.clip_norm = {o.clip_norm}", o.clip_norm >= 0, "0 (off) or a norm"),
         (f"compute.rows = {c.compute.rows}", c.compute.rows >= 0, "0 (whole) or a chunk size"),
     ]
+
+
+def is_inside(name: str) -> bool:
+    """Whether a name is that of a folder below another one: relative, not empty, without `..`."""
+    path = Path(name)
+    return bool(path.parts) and not path.is_absolute() and ".." not in path.parts
 
 
 def _positive(widths: tuple[int, ...]) -> bool:

@@ -17,8 +17,8 @@ from flax import traverse_util
 
 from cmig_jax.config import Config, from_json, to_json
 
-PRETRAINED = Path(__file__).with_name("pretrained") / "quickstart.npz"
-"""The `quickstart` network as `make demo` trains it, on generated objects alone."""
+PRETRAINED = Path(__file__).with_name("pretrained") / "own-clouds.npz"
+"""The network of `train.py own-clouds`, on generated objects alone."""
 CONFIG, STEP = "config.json", "step"
 
 

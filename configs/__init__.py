@@ -6,10 +6,11 @@ from collections.abc import Callable
 
 from cmig_jax.config import Config
 from configs.modelnet40 import corrected, corrected_cpu, modelnet40_cpu, paper, paper_cpu, released, released_cpu
-from configs.quickstart import quickstart
+from configs.quickstart import own_clouds, quickstart
 
 PRESETS: dict[str, Callable[[], Config]] = {
     "quickstart": quickstart,
+    "own-clouds": own_clouds,
     "paper": paper,
     "released": released,
     "corrected": corrected,

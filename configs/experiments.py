@@ -77,6 +77,7 @@ REPEATED = {"model.matching.repeats": 5}
 SOFT = {"model.matching.correspondence": "soft"}
 AT_TEST = ALL_KEYPOINTS | REPEATED | SOFT
 AS_TRAINED = {"model.keypoints.test_count": 0, "model.matching.repeats": 0, "model.matching.correspondence": "hard"}
+AS_RECORDED = {"data.sampling": "twice", "data.crop": "independent", "data.turn": "either"}
 OBSERVED = {"views.of": "both"}  # a recording has no complete object to render
 CORRECTIONS: dict[str, Flags] = {
     "own scores": {"model.keypoints.score_from": "own"},
@@ -242,14 +243,14 @@ EXPERIMENTS: dict[str, Experiment] = {
         baselines=True,
     ),
     "scans": Experiment(
-        "raw range scans of the Stanford bunny and the like, true partial pairs, by networks trained on ModelNet40",
-        NOISE,
+        "raw range scans of the Stanford bunny and the like, true partial pairs, by networks trained on clouds as independent as these",
+        NOISE | AS_RECORDED,
         _recorded("stanford-scans"),
         baselines=True,
     ),
     "fragments": Experiment(
-        "neighbouring fragments of 7-Scenes, true partial pairs, by networks trained on ModelNet40",
-        NOISE,
+        "neighbouring fragments of 7-Scenes, true partial pairs, by networks trained on clouds as independent as these",
+        NOISE | AS_RECORDED,
         _recorded("sevenscenes-fragments"),
         baselines=True,
     ),

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 from cmig_jax.config import (
     Config,
     DataConfig,
@@ -26,6 +28,22 @@ def quickstart() -> Config:
         model=small_network(),
         loss=LossConfig(cross_modal="nt-xent", overlap="off", match_mean="positive"),
         optim=OptimConfig(learning_rate=2e-3, weight_decay=1e-5, schedule="cosine", epochs=10, batch=16, clip_norm=5.0, validate_every=2),
+    )
+
+
+def own_clouds() -> Config:
+    """The network that comes with the package: generated objects, each cloud sampled and cropped on its own, turned to either side."""
+    base = quickstart()
+    model = small_network()
+    return replace(
+        base,
+        name="own-clouds",
+        data=DataConfig(source="shapes", shapes=80, points=512, sampling="twice", crop="independent", turn="either"),
+        model=replace(
+            model,
+            keypoints=replace(model.keypoints, test_count=384),
+            matching=replace(model.matching, correspondence="soft"),
+        ),
     )
 
 

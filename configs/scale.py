@@ -33,7 +33,7 @@ def at_toy_scale(config: Config) -> Config:
     model = small.model
     return replace(
         small,
-        data=replace(small.data, points=32),
+        data=replace(small.data, points=32, shapes=4),
         views=replace(small.views, size=8),
         model=replace(
             model,

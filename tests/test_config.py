@@ -2,6 +2,7 @@
 
 import dataclasses
 import json
+import math
 import re
 
 import pytest
@@ -9,8 +10,9 @@ import pytest
 from cmig_jax.config import Config, FusionConfig, ModelConfig, ViewsConfig, _rules, from_json, to_json
 
 REFUSED = {
+    "name": ["", "../elsewhere", "/anywhere"],
     "seed": [-1],
-    "data.max_translation": [-0.5],
+    "data.max_translation": [-0.5, math.inf],
     "data.test_seed": [-1],
     "data.workers": [-1],
     "model.points.widths": [(), (64, 0)],
@@ -22,11 +24,12 @@ REFUSED = {
     "loss.match_threshold": [-0.05],
     "loss.margins": [(-1.0, 3.0)],
     "optim.weight_decay": [-1e-3],
+    "optim.milestones": [(0,), (50, 50), (75, 50)],
     "optim.decay": [0.0, 2.0],
     "optim.clip_norm": [-1.0],
     "data.points": [0],
     "data.keep": [0.0, 1.5, -0.1],
-    "data.noise_std": [-0.01],
+    "data.noise_std": [-0.01, math.inf],
     "data.noise_clip": [-0.05],
     "data.max_angle_deg": [-1.0, 181.0],
     "data.validation": [0.0, 1.0],

@@ -85,7 +85,7 @@ def test_corrected_sees_what_the_sensor_saw_and_predicts_no_keypoints():
 
 
 def test_the_corrected_presets_take_all_points_as_keypoints_at_test():
-    for name in ("corrected", "corrected-cpu", "quickstart", "modelnet40-cpu"):
+    for name in ("corrected", "corrected-cpu", "quickstart", "own-clouds", "modelnet40-cpu"):
         preset = PRESETS[name]()
         assert preset.model.keypoints.test_count == round(preset.data.points * preset.data.keep)
         assert preset.model.matching.repeats > 0
@@ -106,6 +106,7 @@ TABLE = {
     "data.noise_std": (0.01, None),
     "data.noise_clip": (0.05, None),
     "data.max_angle_deg": (45.0, None),
+    "data.turn": ("positive", None),
     "data.max_translation": (0.5, None),
     "views.of": ("object", None),
     "views.count": (20, None),

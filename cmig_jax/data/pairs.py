@@ -104,7 +104,7 @@ def make_pair(objects: Objects, index: int, data: DataConfig, rng: np.random.Gen
     """
     points = objects.points(index)
     source, target = samplings(points, data.points, data.sampling, index, rng)
-    R, t = random_pose(rng, data.max_angle_deg, data.max_translation)
+    R, t = random_pose(rng, data.max_angle_deg, data.max_translation, data.turn)
     clouds = [source, target @ R.T + t]
     clouds = [cloud[rng.permutation(len(cloud))] for cloud in clouds]
     if data.noise_std > 0:
@@ -144,9 +144,11 @@ def samplings(
     return points[:count], points[:count] if sampling == "once" else points[-count:]
 
 
-def random_pose(rng: np.random.Generator, max_angle_deg: float, max_translation: float) -> tuple[np.ndarray, np.ndarray]:
-    """Draw R = Rx Ry Rz `[3, 3]`, each angle uniform in [0, max_angle_deg] degrees, and t `[3]` uniform in [-max, max]."""
-    x, y, z = rng.uniform(0, max_angle_deg, 3)
+def random_pose(
+    rng: np.random.Generator, max_angle_deg: float, max_translation: float, turn: Literal["positive", "either"] = "positive"
+) -> tuple[np.ndarray, np.ndarray]:
+    """Draw R = Rx Ry Rz `[3, 3]`, each angle uniform in [0 or -max, max] degrees, and t `[3]` uniform in [-max, max]."""
+    x, y, z = rng.uniform(-max_angle_deg if turn == "either" else 0, max_angle_deg, 3)
     R = Rotation.from_euler("zyx", [z, y, x], degrees=True).as_matrix()
     return R, rng.uniform(-max_translation, max_translation, 3)
 

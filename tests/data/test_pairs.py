@@ -94,6 +94,17 @@ def test_rotations_are_Rx_Ry_Rz_with_every_angle_in_range():
     np.testing.assert_allclose(shifts.mean(0), 0, atol=0.05)
 
 
+def test_clouds_may_turn_to_either_side():
+    rng = np.random.default_rng(0)
+    poses = [random_pose(rng, 45.0, 0.5, "either") for _ in range(500)]
+    angles = np.stack([Rotation.from_matrix(R).as_euler("XYZ", degrees=True) for R, _ in poses])
+    assert (angles.min(0) < -44).all()
+    assert (angles.max(0) > 44).all()
+    np.testing.assert_allclose(angles.mean(0), 0, atol=4)
+    pairs = [draw(DataConfig(points=100, turn="either"), seed=seed) for seed in range(20)]
+    assert any(Rotation.from_matrix(pair["R"]).as_euler("XYZ").min() < 0 for pair in pairs)
+
+
 @pytest.mark.parametrize("seed", range(3))
 def test_euler_matrices_multiply_in_the_order_of_the_paper(seed):
     x, y, z = np.random.default_rng(seed).uniform(0, 45, 3)

@@ -13,9 +13,10 @@ from cmig_jax.weights import write_weights
 
 def main(arguments: list[str]) -> int:
     """Load, write, and return the exit code."""
-    if len(arguments) != 2 or Path(arguments[1]).suffix != ".npz":
-        print("usage: python -m cmig_jax.export RUN_FOLDER FILE.npz", file=sys.stderr)
-        return 2
+    asked = arguments in (["-h"], ["--help"])
+    if asked or len(arguments) != 2 or Path(arguments[1]).suffix != ".npz":
+        print("usage: python -m cmig_jax.export RUN_FOLDER FILE.npz", file=sys.stdout if asked else sys.stderr)
+        return 0 if asked else 2
     try:
         network = load(arguments[0])
         write_weights(Path(arguments[1]), network.config, network.step, jax.device_get(network.variables))

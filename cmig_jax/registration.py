@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import functools
+import operator
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -17,7 +18,7 @@ from cmig_jax.data.pairs import Pair
 from cmig_jax.data.render import render_views
 from cmig_jax.nn.build import build, uses_images
 from cmig_jax.structs import RigidTransform
-from cmig_jax.training.checkpoint import load_state, read_config
+from cmig_jax.training.checkpoint import differences, load_state, read_config
 from cmig_jax.training.mesh import device_mesh
 from cmig_jax.training.optim import optimizer
 from cmig_jax.training.predict import Predictor
@@ -61,13 +62,16 @@ def load(
 
     Args:
         source: a run folder of `train.py`, a weights file (`cmig_jax.weights`), or None for the network that comes with the package.
-        which: checkpoint of a run folder: the best on validation, or the last.
+        which: checkpoint of a run folder: the best on validation (the last, if none was validated yet), or the last.
         batch: pairs per compiled call.
         config: flags to use in place of those of the training, such as other keypoints, precision or chunks; the weights must fit.
 
     Raises:
-        ValueError: no run folder, no checkpoint in it, or one that does not fit its config; the message names the file.
+        ValueError: no run folder, no checkpoint in it, or one that does not fit its config; the message names the file. Or a `batch`
+            or `which` that is none.
     """
+    if batch < 1 or which not in ("best", "last"):
+        raise ValueError(f"batch = {batch}, which = {which!r}: expected at least 1, and best or last")
     path = PRETRAINED if source is None else Path(source)
     if path.suffix == ".npz":
         trained, step, variables = read_weights(path)
@@ -76,10 +80,16 @@ def load(
         like = abstract_state(model, optimizer(config.optim, 1), config, device_mesh(1, 1))
         check_variables(variables, like.variables, str(path))
         return Network(config=config, variables=variables, predictor=Predictor(model, batch), step=step)
-    config = config or read_config(path)
+    trained = read_config(path)
+    config = config or trained
     model = build(config)
     like = abstract_state(model, optimizer(config.optim, 1), config, device_mesh(1, 1))
-    state = load_state(path, like, which)
+    try:
+        state = load_state(path, like, which)
+    except ValueError as error:
+        if changed := [flag for flag in differences(trained, config) if flag.startswith("model.")]:
+            raise ValueError(f"{error}; the weights were trained before {'; '.join(changed)}") from error
+        raise
     return Network(config=config, variables=state.variables, predictor=Predictor(model, batch), step=int(state.step))
 
 
@@ -95,7 +105,8 @@ def register(
 
     The clouds may differ in size, density and units, and may overlap in part. They are centred and scaled together to the unit
     sphere, thinned to the number of points that the network knows (the choice is random but always the same), and rendered for its
-    image branch. The network was trained on rotations of up to `data.max_angle_deg` about each axis: expect no more of it.
+    image branch. The network was trained on rotations of up to `data.max_angle_deg` about each axis, to the side or sides that
+    `data.turn` says: expect no more of it. The first call for clouds of some size compiles; clouds above `points` share one size.
 
     Args:
         source: `[N, 3]`, in any unit.
@@ -113,23 +124,22 @@ def register(
             size, and has none.
     """
     network = _pretrained() if network is None else network
+    if not isinstance(network, Network):
+        raise ValueError(f"network = {network!r}: expected what `load` returns")
     x, y = _cloud(source, "source", network.config), _cloud(target, "target", network.config)
     centre_x, centre_y = x.mean(axis=0), y.mean(axis=0)
     scale = max(np.linalg.norm(x - centre_x, axis=1).max(), np.linalg.norm(y - centre_y, axis=1).max())
-    count = network.points if points is None else points
+    count = network.points if points is None else operator.index(points)
     if count < (fewest := _fewest_points(network.config)):
         raise ValueError(f"points = {count}: expected at least {fewest}, the network's neighbours and keypoints")
-    pair = {
-        "source": _thinned((x - centre_x) / scale, count, seed=0).astype(np.float32),
-        "target": _thinned((y - centre_y) / scale, count, seed=1).astype(np.float32),
-    }
+    x, y = (x - centre_x) / scale, (y - centre_y) / scale
+    pair = {"source": _thinned(x, count, seed=0).astype(np.float32), "target": _thinned(y, count, seed=1).astype(np.float32)}
     if uses_images(network.config):
         pair["views"] = _views(pair, network.config)
     R, t = (np.asarray(v[0], np.float64) for v in network([pair]))
-    t = centre_y + scale * t - R @ centre_x
     if refine:
-        R, t = baselines.icp(x, y, max_distance=0.1 * scale, start=(R, t))
-    return RigidTransform(R=R, t=t)  # type: ignore[arg-type]
+        R, t = baselines.icp(x, y, max_distance=0.1, start=(R, t))
+    return RigidTransform(R=R, t=centre_y + scale * t - R @ centre_x)  # type: ignore[arg-type]
 
 
 def _cloud(points: ArrayLike, name: str, config: Config) -> Floats:
@@ -158,7 +168,7 @@ def _cloud(points: ArrayLike, name: str, config: Config) -> Floats:
 
 def _fewest_points(config: Config) -> int:
     keypoints = config.model.keypoints
-    return max(config.model.points.k, 3 if keypoints.select == "all" else keypoints.count)
+    return max(config.model.points.k, 3 if keypoints.select == "all" or keypoints.test_count else keypoints.count)
 
 
 def _thinned(cloud: Floats, count: int, seed: int) -> Floats:

@@ -9,13 +9,17 @@ from __future__ import annotations
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 from flax import struct
 from jax import Array
 
 
 @struct.dataclass
 class RigidTransform:
-    """A rotation R `[..., 3, 3]` and a translation t `[..., 3]`; leading axes are batch axes."""
+    """A rotation R `[..., 3, 3]` and a translation t `[..., 3]`; leading axes are batch axes.
+
+    Of NumPy arrays (what `register` returns) the methods make NumPy arrays, in their precision.
+    """
 
     R: Array
     t: Array
@@ -27,19 +31,23 @@ class RigidTransform:
 
     def apply(self, points: Array) -> Array:
         """Move points `[..., P, 3]`."""
-        moved = jnp.einsum("...ij,...pj->...pi", self.R, points, precision=jax.lax.Precision.HIGHEST)
-        return moved + self.t[..., None, :]
+        return _product("...ij,...pj->...pi", self.R, points) + self.t[..., None, :]
 
     def compose(self, first: RigidTransform) -> RigidTransform:
         """Return the transform that applies `first`, then this one: `a_from_b.compose(b_from_c)` is `a_from_c`."""
-        R = jnp.einsum("...ij,...jk->...ik", self.R, first.R, precision=jax.lax.Precision.HIGHEST)
+        R = _product("...ij,...jk->...ik", self.R, first.R)
         return RigidTransform(R=R, t=self.apply(first.t[..., None, :])[..., 0, :])
 
     def inverse(self) -> RigidTransform:
         """Return the transform that undoes this one."""
-        R = jnp.swapaxes(self.R, -1, -2)
-        t = -jnp.einsum("...ij,...j->...i", R, self.t, precision=jax.lax.Precision.HIGHEST)
-        return RigidTransform(R=R, t=t)
+        R = self.R.swapaxes(-1, -2)
+        return RigidTransform(R=R, t=-_product("...ij,...j->...i", R, self.t))
+
+
+def _product(subscripts: str, a: Array, b: Array) -> Array:
+    if isinstance(a, np.ndarray) and isinstance(b, np.ndarray):
+        return np.einsum(subscripts, a, b)
+    return jnp.einsum(subscripts, a, b, precision=jax.lax.Precision.HIGHEST)
 
 
 @struct.dataclass

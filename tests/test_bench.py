@@ -11,6 +11,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from cmig_jax.bench.__main__ import has_gpu
 from cmig_jax.bench.cases import CASES, make_arrays
 from cmig_jax.bench.clock import KEPT, OURS, PYTORCH, Timing, in_turns
 from cmig_jax.bench.clouds import measure_clouds
@@ -53,6 +54,18 @@ def test_no_repetitions_is_an_error():
     done = subprocess.run([sys.executable, "-m", "cmig_jax.bench", "--repetitions", "0"], capture_output=True, text=True, check=False)
     assert done.returncode == 1
     assert "expected at least 1" in done.stderr
+
+
+@pytest.mark.parametrize(
+    ("flags", "message"), [(["--clouds", "3"], "--clouds 3: expected at least 256"), (["--device", "gpu"], "finds none")]
+)
+def test_what_cannot_be_measured_is_one_line_of_error(flags, message):
+    if "gpu" in flags and has_gpu():
+        pytest.skip("there is a GPU")
+    done = subprocess.run([sys.executable, "-m", "cmig_jax.bench", *flags], capture_output=True, text=True, check=False)
+    assert done.returncode == 1
+    assert done.stderr.count("\n") == 1
+    assert message in done.stderr
 
 
 def test_work_is_done_in_turns():

@@ -82,6 +82,27 @@ def test_a_report_of_no_pair_is_one_line_of_error(main, trained):
     assert_one_line(main("evaluate.py", trained[0], "--report", "--report-pairs", 0), "report_pairs = 0: expected at least 1 pair")
 
 
+@pytest.mark.parametrize("out", ["", "../outside", "/outside", "checkpoints"])
+def test_results_go_nowhere_else(main, trained, out):
+    assert_one_line(main("evaluate.py", trained[0], "--out", out), f"out = {out!r}: expected the name of a")
+
+
+def test_batches_of_no_pair_are_one_line_of_error(main, trained):
+    assert_one_line(main("evaluate.py", trained[0], "--batch", 0), "batch = 0: expected at least 1 pair")
+
+
+def test_a_run_that_was_stopped_early_is_evaluated_and_says_so(main, trained, tmp_path):
+    run = shutil.copytree(trained[0], tmp_path / "stopped")
+    (run / "log.jsonl").write_bytes(b"")
+    for path in (run / "checkpoints").rglob("metrics/*"):
+        path.write_text("{}")
+    finished = main("evaluate.py", run, "--limit", 1, "--batch", 4, "--out", "early")
+    assert finished.returncode == 0, finished.stderr
+    assert "none of its checkpoints was validated, so this is the last one" in finished.stdout
+    assert "no training curve: " in finished.stdout
+    assert json.loads((run / "early" / "results.json").read_text())["config"]["checkpoint"]["which"] == "last"
+
+
 @pytest.mark.parametrize("name", ["pairs", "views", "curve"])
 def test_the_pictures_show_something(evaluated, name):
     pixels = matplotlib.image.imread(evaluated[0] / "evaluation" / f"{name}.png")[..., :3]

@@ -124,6 +124,37 @@ def test_refinement_sharpens_a_pose_that_is_close(network, clouds_of_two_sizes, 
     source = (target - target.mean(axis=0)) @ R.T
     found = register(source, target, network, refine=True)
     np.testing.assert_allclose(source @ found.R.T + found.t, target, atol=1e-3)
+    np.testing.assert_allclose(found.apply(source), target, atol=1e-3)
+
+
+@pytest.mark.parametrize("scale", [1e-6, 1e6])
+def test_refinement_does_not_depend_on_the_unit(network, clouds_of_two_sizes, monkeypatch, scale):
+    monkeypatch.setattr(Network, "__call__", lambda self, pairs: (np.eye(3)[None], np.zeros((1, 3))))
+    target = clouds_of_two_sizes[1]
+    source = (target - target.mean(axis=0)) @ Rotation.from_euler("z", 1, degrees=True).as_matrix().T
+    found = register(scale * source, scale * target, network, refine=True)
+    np.testing.assert_allclose(found.apply(scale * source) / scale, target, atol=1e-3)
+
+
+def test_a_network_that_tests_with_all_points_takes_fewer_than_it_was_trained_with(network, clouds_of_two_sizes):
+    model = network.config.model
+    every = dataclasses.replace(
+        network.config, model=dataclasses.replace(model, keypoints=dataclasses.replace(model.keypoints, test_count=36))
+    )
+    few = dataclasses.replace(network, config=every, predictor=Predictor(build(every), 1))
+    assert_rotation(register(clouds_of_two_sizes[0][: FEWEST - 1], clouds_of_two_sizes[1], few).R)
+
+
+@pytest.mark.parametrize("network", ["runs/quickstart", 3])
+def test_what_is_no_network_is_refused(clouds_of_two_sizes, network):
+    with pytest.raises(ValueError, match=f"network = {network!r}: expected what `load` returns"):
+        register(*clouds_of_two_sizes, network)
+
+
+@pytest.mark.parametrize("asked", [{"batch": 0}, {"which": "worst"}])
+def test_a_batch_or_checkpoint_that_is_none_is_refused(asked):
+    with pytest.raises(ValueError, match=f"{next(iter(asked))} = .*expected at least 1, and best or last"):
+        load(**asked)
 
 
 def line(points):
@@ -186,6 +217,16 @@ def test_a_loaded_network_registers_like_the_one_that_was_saved(tiny, state, net
     assert loaded.config == tiny
     assert loaded.step == 3
     jax.tree.map(np.testing.assert_array_equal, dict(loaded.variables), dict(network.variables))
+
+
+def test_flags_that_do_not_fit_the_weights_are_named(tiny, state, tmp_path):
+    write_config(tmp_path, tiny)
+    checkpoints = Checkpoints(tmp_path)
+    checkpoints.save(3, state, {}, None)
+    checkpoints.close()
+    longer = dataclasses.replace(tiny.model, matching=dataclasses.replace(tiny.model.matching, iterations=4))
+    with pytest.raises(ValueError, match=r"trained before model\.matching\.iterations: \d -> 4"):
+        load(tmp_path, config=dataclasses.replace(tiny, model=longer))
 
 
 def test_a_run_folder_that_does_not_exist_is_named(tmp_path):

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import json as serialiser
+import subprocess
 import sys
 from pathlib import Path
 from typing import Any, Literal
@@ -45,6 +46,10 @@ def main(
     """
     if repetitions < 1:
         sys.exit(f"error: --repetitions {repetitions}: expected at least 1")
+    if clouds and min(clouds) < (fewest := CASES["points"].sizes.keypoints):
+        sys.exit(f"error: --clouds {min(clouds)}: expected at least {fewest} points, the network's keypoints")
+    if device == "gpu" and not has_gpu():
+        sys.exit("error: --device gpu: JAX finds none here")
     if clouds:
         results: dict[str, Any] = {"clouds": measure_clouds(clouds, dataclasses.replace(compute, rows=compute.rows or 512), device)}
         print("\n".join(cloud_lines(results["clouds"])))
@@ -58,6 +63,11 @@ def main(
     if json is not None:
         header = {"device": device, "repetitions": repetitions, "compute": dataclasses.asdict(compute), "jax": jax.__version__}
         json.write_text(serialiser.dumps(header | results, indent=1) + "\n")
+
+
+def has_gpu() -> bool:
+    """Whether JAX finds a GPU; asked in another process, since JAX takes most of its memory as soon as it looks."""
+    return subprocess.run([sys.executable, "-c", "import jax; jax.devices('gpu')"], capture_output=True, check=False).returncode == 0
 
 
 def case_lines(name: str, result: dict[str, Any]) -> list[str]:
@@ -89,4 +99,4 @@ def cloud_lines(rows: list[dict[str, float]]) -> list[str]:
 
 
 if __name__ == "__main__":
-    tyro.cli(main)
+    tyro.cli(main, prog="python -m cmig_jax.bench")

@@ -72,12 +72,14 @@ def prepare(config: Config, out: str | Path, *, workers: int | None = None, prog
         The folder.
 
     Raises:
-        ValueError: raw data that cannot be read, or a folder that was prepared with other settings.
+        ValueError: raw data that cannot be read, a folder that was prepared with other settings, or less than one worker.
         OSError: too little space, naming the folder, the bytes needed and the bytes free. Nothing is left half-written.
             Or a worker that ended early, as in a script that calls this without `if __name__ == "__main__":`.
     """
     if getattr(multiprocessing.current_process(), "_inheriting", False):  # a worker that imports the script; it would wait for its parent
         raise RuntimeError("a script that prepares data needs `if __name__ == '__main__':`, since its workers import it")
+    if workers is not None and workers < 1:
+        raise ValueError(f"workers = {workers}: expected at least 1 process")
     out = Path(out)
     settings = settings_of(config)
     raw = open_raw(config.data)

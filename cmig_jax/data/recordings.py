@@ -32,6 +32,7 @@ SOURCES = ("stanford-scans", "sevenscenes-fragments")
 """The values of `data.source` that are recordings."""
 FORMAT = 1
 MANIFEST = "pairs.json"
+KEYS = {"settings", "categories", "recordings", "pairs"}
 OVERLAP = 0.3
 NEAR = 0.02
 """In units of the pair, whose larger cloud is scaled to the unit sphere: 2 mm for the Stanford bunny, 3.5 cm for a room."""
@@ -90,7 +91,7 @@ def read_manifest(folder: Path) -> dict[str, Any]:
         manifest = json.loads(path.read_text())
     except (OSError, ValueError) as error:
         raise ValueError(f"{path}: not readable ({error}); delete it, and it is made anew") from error
-    if not isinstance(manifest, dict) or manifest.get("format") != FORMAT:
+    if not isinstance(manifest, dict) or manifest.get("format") != FORMAT or not manifest.keys() >= KEYS:
         raise ValueError(f"{path}: expected a manifest of format {FORMAT}; name another folder (data.prepared)")
     return manifest
 

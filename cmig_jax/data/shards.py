@@ -27,6 +27,7 @@ from cmig_jax.config import Config
 
 FORMAT = 1
 MANIFEST = "manifest.json"
+KEYS = {"settings", "categories", "distinct", "splits"}
 
 
 class Shards:
@@ -158,7 +159,7 @@ def read_manifest(folder: Path) -> dict[str, Any]:
         manifest = json.loads(path.read_text())
     except ValueError as error:
         raise ValueError(f"{path} is not JSON ({error}): delete it and prepare the folder again") from error
-    if not isinstance(manifest, dict) or manifest.get("format") != FORMAT:
+    if not isinstance(manifest, dict) or manifest.get("format") != FORMAT or not manifest.keys() >= KEYS:
         raise ValueError(f"{path}: expected a manifest of format {FORMAT}; prepare the objects into another folder")
     return manifest
 

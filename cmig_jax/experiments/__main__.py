@@ -64,8 +64,8 @@ def main(arguments: list[str] | None = None) -> int:
     except (ValueError, OSError) as error:
         print(f"error: {error}", file=sys.stderr)
         return 2
-    except (Interrupted, KeyboardInterrupt) as error:
-        print(f"{error or 'stopped'}; the same command continues", file=sys.stderr)
+    except (Interrupted, KeyboardInterrupt):
+        print("stopped; the same command continues", file=sys.stderr)
         return 130
 
 
@@ -88,8 +88,8 @@ def _flags(flags: object) -> str:
 def run_all(command: Run) -> int:
     """Run the named experiments, one after the other, and return 1 if a row of them failed."""
     names = tuple(EXPERIMENTS) if command.names == ("all",) else command.names
-    if unknown := [name for name in names if name not in EXPERIMENTS]:
-        raise ValueError(f"experiment {unknown[0]}: expected all, or some of {', '.join(EXPERIMENTS)}")
+    if unknown := [name for name in names if name not in EXPERIMENTS] or [""] * (not names):
+        raise ValueError(f"experiment {unknown[0]!r}: expected all, or some of {', '.join(EXPERIMENTS)}")
     failed = False
     for name in names:
         experiment, jobs = EXPERIMENTS[name], jobs_of(command, name)

@@ -105,7 +105,8 @@ class CMIGNet(nn.Module):
         N, M = batch.source.shape[1], batch.target.shape[1]
         if self.score is not None and self.score_from == "other" and N != M:
             raise ValueError(f"score_from=other picks points by the other cloud's index: expected N = M, got {N} and {M} points")
-        fewest = max(self.points.k, 1 if self.select == "all" else self.keypoints)
+        of_keypoints = 1 if self.select == "all" or (self.test_keypoints and not train) else self.keypoints
+        fewest = max(self.points.k, of_keypoints)
         if min(N, M) < fewest:
             raise ValueError(f"expected at least {fewest} points (neighbours, keypoints) in each cloud, got {N} and {M}")
         if train and batch.target_from_source is None:

@@ -200,7 +200,7 @@ def _legend(figure: Figure, pairs: Sequence[Mapping[str, Any]]) -> None:
 
 
 def _read_log(log_path: Path) -> list[dict[str, Any]]:
-    texts = log_path.read_text().splitlines()
+    texts = log_path.read_text(errors="replace").splitlines()
     lines = []
     for i, text in enumerate(texts):
         try:

@@ -10,7 +10,7 @@ from typing import Any, Literal
 import numpy as np
 
 from cmig_jax import baselines
-from cmig_jax.config import Config, to_json
+from cmig_jax.config import Config, is_inside, to_json
 from cmig_jax.data.pairs import Pair, Pairs, evenly_spaced, in_categories
 from cmig_jax.data.prepare import ensure_prepared
 from cmig_jax.data.recorded_pairs import RecordedPairs
@@ -28,7 +28,7 @@ from cmig_jax.report.overlap import Measured
 from cmig_jax.report.page import Report, write_page
 from cmig_jax.report.plots import plot_curve, plot_pairs, plot_views
 from cmig_jax.report.tables import latex_table, markdown_table, text_table
-from cmig_jax.training.checkpoint import write_atomically
+from cmig_jax.training.checkpoint import is_validated, write_atomically
 
 NETWORK = "CMIGNet"
 PAGE = "report.html"
@@ -55,18 +55,25 @@ def evaluate_run(
         which: checkpoint.
         limit: how many test pairs, evenly spaced; None: all.
         batch: pairs per call of the network.
-        out: folder inside the run folder.
+        out: name of the folder inside the run folder.
         report_pairs: also write the report (`report.html` and its figures), with this many pairs.
 
     Returns:
         What `results.json` holds.
 
     Raises:
-        ValueError: no checkpoint, or no test objects in the chosen categories; `report_pairs` below 1.
+        ValueError: no checkpoint, or no test objects in the chosen categories; `report_pairs` or `batch` below 1; an `out` elsewhere.
     """
     if report_pairs is not None and report_pairs < 1:
         raise ValueError(f"report_pairs = {report_pairs}: expected at least 1 pair")
+    if batch < 1:
+        raise ValueError(f"batch = {batch}: expected at least 1 pair")
+    if not is_inside(out) or Path(out).parts[0] in ("checkpoints", "tensorboard"):
+        raise ValueError(f"out = {out!r}: expected the name of a new folder, or of one that results are in, inside the run folder")
     network = load(run, which, batch, config=config)
+    if which == "best" and not is_validated(run):
+        print(f"{run}: none of its checkpoints was validated, so this is the last one, step {network.step}")
+        which = "last"
     pairs = pairs_to_test(config, limit)
     measured = Measured(pairs, config.loss.match_threshold)
     folder = run / out
@@ -76,8 +83,8 @@ def evaluate_run(
     write_atomically(folder / "table.md", markdown_table(results))
     write_atomically(folder / "table.tex", latex_table(results))
     errors = read_errors(folder / ERRORS, network=NETWORK, overlap=measured.overlaps, categories=pairs.categories)
-    draw(run, folder, network, pairs, errors)
     print(text_table(results))
+    draw(run, folder, network, pairs, errors)
     for name, reason in baselines.missing().items():
         print(f"without {name}: {reason}")
     if report_pairs is not None:
@@ -135,7 +142,10 @@ def draw(run: Path, folder: Path, network: Network, pairs: Pairs | RecordedPairs
     if "views" in chosen[0]:
         plot_views(chosen[0]["views"][0], folder / "views.png", title="depth views of the source")
     if (run / "log.jsonl").exists():
-        plot_curve(run / "log.jsonl", folder / "curve.png")
+        try:
+            plot_curve(run / "log.jsonl", folder / "curve.png")
+        except ValueError as error:
+            print(f"no training curve: {error}")
 
 
 def picture(pair: Pair, found: Matches | None, errors: Errors, position: int) -> dict[str, Any]:

@@ -9,15 +9,19 @@ import logging
 import math
 import os
 import sys
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any, Literal, TypeVar
 
 from orbax.checkpoint import v1 as ocp
 
 from cmig_jax.config import Config, from_json, to_json
 
 MEASURE = "val_rmse_r_deg"  # what the best checkpoint is chosen by
+FREE = ("name", "data.root", "data.prepared", "compute.recompute", "compute.rows")
+"""Flags that a run may change where it continues: they change where things are and how they are computed, not what."""
+
+T = TypeVar("T")
 
 
 class Checkpoints:
@@ -27,11 +31,8 @@ class Checkpoints:
         policies = ocp.training.preservation_policies
         best = policies.BestN(get_metric_fn=_rank, n=1, keep_checkpoints_without_metrics=False)
         self._folder = (run / "checkpoints").absolute()
-        self._checkpointer: Any = ocp.training.Checkpointer(
-            str(self._folder),
-            preservation_policy=policies.AnyPreservationPolicy([policies.LatestN(1), best]),  # pyright: ignore[reportArgumentType]
-            cleanup_tmp_directories=True,
-        )
+        kept = policies.AnyPreservationPolicy([policies.LatestN(1), best])
+        self._checkpointer = _opened(self._folder, preservation_policy=kept, cleanup_tmp_directories=True)
 
     def save(self, step: int, state: Any, iterator: dict[str, Any], measures: dict[str, float] | None = None) -> None:
         """Save the state after `step` steps with the input pipeline's position and, at the end of an epoch, validation measures."""
@@ -42,13 +43,12 @@ class Checkpoints:
 
     def restore_last(self, like: Any) -> tuple[Any, dict[str, Any]] | None:
         """Return the last state, typed and placed as the abstract `like` says, and the pipeline's position; None if there is none."""
-        latest = self._checkpointer.latest
+        latest = _read(f"{self._folder}", lambda: self._checkpointer.latest)
         if latest is None:
             return None
-        with _silent("absl", "asyncio"):
-            metadata = self._checkpointer.metadata(latest.step)
-        assert isinstance(metadata.custom_metadata, dict)
-        return _load(self._checkpointer, self._folder, latest.step, like), metadata.custom_metadata["iterator"]
+        where = f"{self._folder}, step {latest.step}"
+        iterator = _read(where, lambda: self._checkpointer.metadata(latest.step).custom_metadata["iterator"])
+        return _read(where, lambda: self._checkpointer.load(latest.step, like)), iterator
 
     def close(self) -> None:
         """Finish writing."""
@@ -60,7 +60,7 @@ def _rank(metrics: Any) -> float:
 
 
 def write_config(run: Path, config: Config) -> None:
-    """Write `config.json` into a run folder, or check that it holds the same flags.
+    """Write `config.json` into a run folder, where it is not of another config.
 
     Raises:
         ValueError: the folder is of another config; the message names the flags that differ.
@@ -71,14 +71,14 @@ def write_config(run: Path, config: Config) -> None:
 
 
 def check_config(run: Path, config: Config) -> None:
-    """Refuse a run folder of another config; one without a config is fine.
+    """Refuse a run folder of another config; one without a config is fine, and so are flags that change nothing that is computed.
 
     Raises:
         ValueError: the message names the flags that differ.
     """
     path = run / "config.json"
-    if path.exists() and (changed := differences(read_config(run), config)):
-        raise ValueError(f"{path} is of another config ({'; '.join(changed)}): choose another --name, or remove the folder")
+    if path.exists() and (changed := [flag for flag in differences(read_config(run), config) if flag.split(":")[0] not in FREE]):
+        raise ValueError(f"{path} is of another config ({'; '.join(changed)}): continue with its flags, or choose another --name")
 
 
 def read_config(run: Path) -> Config:
@@ -120,9 +120,15 @@ def last_step(run: Path) -> int | None:
     folder = (run / "checkpoints").absolute()
     if not folder.is_dir():
         return None
-    with ocp.training.Checkpointer(str(folder)) as checkpointer:
-        latest = checkpointer.latest
+    with _opened(folder) as checkpointer:
+        latest = _read(f"{folder}", lambda: checkpointer.latest)
         return None if latest is None else latest.step
+
+
+def is_validated(run: Path) -> bool:
+    """Whether a checkpoint of a run has validation measures, so that `best` means more than `last`."""
+    with _opened((run / "checkpoints").absolute()) as checkpointer:
+        return any(_rank(checkpoint.metrics) > -math.inf for checkpoint in checkpointer.checkpoints)
 
 
 def load_state(run: Path, like: Any, which: Literal["best", "last"] = "best") -> Any:
@@ -131,7 +137,7 @@ def load_state(run: Path, like: Any, which: Literal["best", "last"] = "best") ->
     Args:
         run: the run folder.
         like: an abstract state of its network (`state.abstract_state`).
-        which: `best` on validation, or `last`.
+        which: `best` on validation (the last, if none was validated yet), or `last`.
 
     Raises:
         ValueError: no checkpoint there, or one that is unreadable or of another network; the message names the folder.
@@ -139,27 +145,31 @@ def load_state(run: Path, like: Any, which: Literal["best", "last"] = "best") ->
     folder = (run / "checkpoints").absolute()
     if not folder.is_dir():
         raise ValueError(f"{folder}: expected checkpoints, found no such folder (has train.py run long enough to save one?)")
-    with ocp.training.Checkpointer(str(folder)) as checkpointer:
-        found = checkpointer.checkpoints
+    with _opened(folder) as checkpointer:
+        found = _read(f"{folder}", lambda: checkpointer.checkpoints)
         if not found:
             raise ValueError(f"{folder}: expected a checkpoint, found none (has train.py run long enough to save one?)")
         chosen = max(found, key=lambda c: (_rank(c.metrics) if which == "best" else 0, c.step))
-        return _load(checkpointer, folder, chosen.step, like)
+        return _read(f"{folder}, step {chosen.step}", lambda: checkpointer.load(chosen.step, like))
 
 
-def _load(checkpointer: Any, folder: Path, step: int, like: Any) -> Any:
-    """Load one checkpoint; where it fails, say why once: Orbax names the last handler that it tried, and logs what every task met."""
+def _opened(folder: Path, **options: Any) -> Any:
+    return _read(f"{folder}", lambda: ocp.training.Checkpointer(str(folder), **options))
+
+
+def _read(where: str, read: Callable[[], T]) -> T:
+    """Read from checkpoints; where it fails, say why once: Orbax names the last handler that it tried, and logs what every task met."""
     with _silent("absl", "asyncio"):
         try:
-            return checkpointer.load(step, like)
-        except (ValueError, KeyError, OSError) as error:
+            return read()
+        except (ValueError, KeyError, TypeError, OSError) as error:
             cause: BaseException = error
             while cause.__cause__ is not None:
                 cause = cause.__cause__
             text = (str(cause).splitlines() or [type(cause).__name__])[0][:300]
             del cause
         gc.collect()  # the tasks that were dropped speak up when they are collected
-    raise ValueError(f"{folder}, step {step}: expected a whole checkpoint of the network in config.json ({text})")
+    raise ValueError(f"{where}: expected a whole checkpoint of the network in config.json ({text})")
 
 
 @contextlib.contextmanager

@@ -81,6 +81,8 @@ def train(config: Config, run: Path, *, resume: bool = False, progress: bool = T
 
 def training_data(config: Config) -> TrainingData:
     """Prepare the objects if need be, and split the training objects of the chosen categories."""
+    if config.data.source == "stanford":
+        raise ValueError("data.source = stanford has no objects to train on: expected another (evaluate.py takes it)")
     folder = ensure_prepared(config)
     check_settings(folder, config)
     objects = Shards(folder, "train")
@@ -110,7 +112,8 @@ class _Run:
             self.state: TrainState = create_state(model, rule, config, self.mesh)
         else:
             self.state = restored[0]
-            self.batches.set_state(restored[1])
+            if restored[1]:  # a network converted from PyTorch has none
+                self.batches.set_state(restored[1])
         self.step = int(self.state.step)
         self.update: Step = compiled_first(make_step(model, rule, config, self.mesh))
         self.key = jax.random.key(config.seed)

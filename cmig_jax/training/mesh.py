@@ -20,12 +20,12 @@ def device_mesh(batch: int, devices: int | None = None) -> Mesh:
         devices: how many to use; by default the most that divide the batch (of several processes: all).
 
     Raises:
-        ValueError: a batch that does not divide over all devices of several processes, or more devices than there are.
+        ValueError: a batch that does not divide over all devices of several processes, or devices that are none, or more than there are.
     """
     available = jax.device_count()
     if devices is None:
         devices = max(n for n in range(1, available + 1) if batch % n == 0)
-    if devices > available or batch % devices:
+    if not 1 <= devices <= available or batch % devices:
         raise ValueError(f"{devices} devices: expected a divisor of the batch of {batch} pairs, at most {available}")
     if jax.process_count() > 1 and devices != available:
         raise ValueError(f"optim.batch = {batch}: expected a multiple of the {available} devices of {jax.process_count()} processes")

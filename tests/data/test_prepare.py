@@ -314,10 +314,18 @@ def test_generated_shapes_by_the_command_line_and_two_workers(tmp_path, monkeypa
     assert len(Shards(tmp_path / "prepared", "train")) == manifest["objects"]["train"] == 160
 
 
+@pytest.mark.parametrize("text", ["{}", '{"format": 1}', "[]"])
+def test_what_is_no_manifest_is_named(tmp_path, text):
+    (tmp_path / "manifest.json").write_text(text)
+    with pytest.raises(ValueError, match=r"manifest\.json: expected a manifest of format 1"):
+        Shards(tmp_path, "train")
+
+
 @pytest.mark.parametrize(
     "flags",
     [
         ["--data.source", "meshes", "--data.root", "no/such/folder"],
+        ["--data.source", "shapes", "--workers", "0"],
         ["--data.source", "meshes"],
         ["--views.count", "7"],
         ["--verify", "--out", "no/such/folder"],

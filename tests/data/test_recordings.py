@@ -156,9 +156,10 @@ def test_what_is_damaged_or_of_another_source_is_named(data, tmp_path):
         pairs[0]
     with pytest.raises(ValueError, match=r"data\.source = sevenscenes-fragments, but .* was prepared with data\.source = stanford-scans"):
         ensure_recordings(replace(data, source="sevenscenes-fragments"))
-    (tmp_path / "out" / MANIFEST).write_text("{}")
-    with pytest.raises(ValueError, match=r"pairs\.json: expected a manifest of format 1"):
-        pairs_of(data)
+    for text in ("{}", '{"format": 1}'):
+        (tmp_path / "out" / MANIFEST).write_text(text)
+        with pytest.raises(ValueError, match=r"pairs\.json: expected a manifest of format 1"):
+            pairs_of(data)
     (tmp_path / "out" / MANIFEST).write_text("{")
     with pytest.raises(ValueError, match=r"pairs\.json: not readable"):
         pairs_of(data)

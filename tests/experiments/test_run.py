@@ -123,6 +123,8 @@ def test_data_that_is_not_given_leaves_a_row_empty_and_a_failure_is_shown(tmp_pa
 def test_an_unknown_experiment_is_an_error_and_the_list_has_all(capsys):
     assert main(["run", "table9"]) == 2
     assert "table9" in capsys.readouterr().err
+    assert main(["run"]) == 2
+    assert "expected all, or some of table1" in capsys.readouterr().err
     assert main(["list"]) == 0
     printed = capsys.readouterr().out
     assert all(f"{name}: {experiment.about}" in printed for name, experiment in EXPERIMENTS.items())

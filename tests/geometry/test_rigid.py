@@ -52,6 +52,17 @@ def test_apply_is_R_x_plus_t():
     np.testing.assert_allclose(a.apply(jnp.asarray(points))[0], points[0] @ np.asarray(a.R[0]).T + np.asarray(a.t[0]), atol=1e-14)
 
 
+def test_numpy_stays_numpy_with_all_its_digits():
+    with jax.enable_x64(False):
+        R, offset = Rotation.from_euler("z", 30, degrees=True).as_matrix(), np.array([5e6, 1e7, 0.123])
+        a = RigidTransform(R=R, t=offset)
+        points = np.random.default_rng(0).normal(size=(7, 3)) + offset
+        np.testing.assert_allclose(a.apply(points), points @ R.T + offset, rtol=1e-15)
+        np.testing.assert_allclose(a.inverse().apply(a.apply(points)), points, rtol=1e-14)
+        np.testing.assert_allclose(a.inverse().compose(a).t, 0, atol=1e-8)
+        assert {type(x) for b in (a.inverse(), a.compose(a)) for x in (b.R, b.t)} == {np.ndarray}
+
+
 def test_identity_keeps_the_dtype_asked_for():
     assert {leaf.dtype for leaf in jax.tree.leaves(RigidTransform.identity((2,)))} == {jnp.dtype("float32")}
     assert {leaf.dtype for leaf in jax.tree.leaves(transforms(0).compose(transforms(1)).inverse())} == {jnp.dtype("float64")}

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from cmig_jax.config import Config
-from cmig_jax.training.checkpoint import MEASURE, Checkpoints, differences, load_state, read_config, write_config
+from cmig_jax.training.checkpoint import MEASURE, Checkpoints, differences, is_validated, load_state, read_config, write_config
 from cmig_jax.training.mesh import device_mesh, replicated
 from cmig_jax.training.state import TrainState
 
@@ -72,6 +72,9 @@ def test_the_best_on_validation_and_the_last_are_kept(tmp_path):
 def test_a_run_that_was_never_validated_has_its_last_state(tmp_path):
     save(tmp_path, [None, None])
     assert_is(load_state(tmp_path, abstract(), "best"), 20)
+    assert not is_validated(tmp_path)
+    save(tmp_path / "another", [1.0, None])
+    assert is_validated(tmp_path / "another")
 
 
 def test_a_step_is_saved_once(tmp_path):
@@ -124,6 +127,15 @@ def damage_emptied_metadata(step):
         path.write_text("")
 
 
+def test_a_folder_of_emptied_files_is_named(tmp_path):
+    save(tmp_path, [1.0])
+    for path in (tmp_path / "checkpoints").rglob("*"):
+        if path.is_file():
+            path.write_text("")
+    with pytest.raises(ValueError, match=f"{tmp_path}/checkpoints.*: expected a whole checkpoint of the network"):
+        load_state(tmp_path, abstract())
+
+
 @pytest.mark.parametrize("damage", [damage_removed_arrays, damage_truncated, damage_emptied_metadata])
 def test_a_damaged_checkpoint_is_refused(tmp_path, damage):
     save(tmp_path, [1.0])
@@ -154,6 +166,13 @@ def test_another_config_is_refused_by_the_flags_that_differ(tmp_path):
         write_config(tmp_path, changed)
     assert read_config(tmp_path) == Config()
     assert differences(Config(), Config()) == []
+
+
+def test_where_things_are_may_change_where_a_run_continues(tmp_path):
+    write_config(tmp_path, Config())
+    moved = dataclasses.replace(Config(), name="renamed", data=dataclasses.replace(Config().data, root="elsewhere"))
+    write_config(tmp_path, moved)
+    assert read_config(tmp_path) == moved
 
 
 @pytest.mark.parametrize("text", ["", "{", '{"nam": "x"}', "[]"])

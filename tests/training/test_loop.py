@@ -11,7 +11,7 @@ import pytest
 from cmig_jax.data.shards import Shards
 from cmig_jax.nn.build import build
 from cmig_jax.training import loop
-from cmig_jax.training.checkpoint import load_state, read_config
+from cmig_jax.training.checkpoint import Checkpoints, load_state, read_config, write_config
 from cmig_jax.training.loop import Interrupted, NonFiniteLoss, train, training_data
 from cmig_jax.training.mesh import device_mesh
 from cmig_jax.training.optim import optimizer
@@ -125,14 +125,38 @@ def test_resuming_a_finished_run_changes_nothing(tiny, uninterrupted):
     assert (uninterrupted / "log.jsonl").read_text() == log
 
 
+def test_a_network_from_elsewhere_is_trained_on(tiny, uninterrupted, tmp_path):
+    """As `parity convert` makes it: weights at step 0, and no position in the data."""
+    state = last_state(tiny, uninterrupted)
+    checkpoints = Checkpoints(tmp_path)
+    checkpoints.save(0, state.replace(step=np.zeros_like(state.step)), iterator={})
+    checkpoints.close()
+    write_config(tmp_path, tiny)
+    train(tiny, tmp_path, resume=True, progress=False, devices=1)
+    assert int(last_state(tiny, tmp_path).step) == TOTAL
+
+
 def test_a_folder_that_holds_a_run_needs_resume(tiny, uninterrupted):
     with pytest.raises(ValueError, match="holds a run: add --resume to continue it, or choose another --name"):
         train(tiny, uninterrupted, progress=False, devices=1)
 
 
 def test_a_run_is_not_continued_with_other_flags(tiny, uninterrupted):
-    with pytest.raises(ValueError, match=r"is of another config \(seed: 0 -> 1\): choose another --name"):
+    with pytest.raises(ValueError, match=r"is of another config \(seed: 0 -> 1\): continue with its flags, or choose another --name"):
         train(dataclasses.replace(tiny, seed=1), uninterrupted, resume=True, progress=False, devices=1)
+
+
+@pytest.mark.parametrize("devices", [0, -1, 99])
+def test_devices_that_are_none_are_refused_and_leave_no_folder(tiny, tmp_path, devices):
+    with pytest.raises(ValueError, match=f"{devices} devices: expected a divisor of the batch"):
+        train(tiny, tmp_path / "run", progress=False, devices=devices)
+    assert not (tmp_path / "run").exists()
+
+
+def test_models_for_evaluation_are_refused_before_they_are_prepared(tiny, tmp_path):
+    config = dataclasses.replace(tiny, data=dataclasses.replace(tiny.data, source="stanford", root=str(tmp_path)))
+    with pytest.raises(ValueError, match=r"data\.source = stanford has no objects to train on"):
+        train(config, tmp_path / "run", progress=False)
 
 
 @pytest.mark.parametrize("change", [{"batch": 1000}, {"batch": 6}])

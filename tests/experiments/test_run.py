@@ -1,8 +1,9 @@
-"""Experiments from their command to their table, at toy size. A table is run each time, and one of its networks on recorded pairs; all
+"""Experiments from their command to their table, at toy size. Two rows are run each time, and one of their networks on recorded pairs; all
 others, a compilation or two for each row, by `pytest -m slow tests/experiments`. `test_rows.py` traces every row each time."""
 
 import json
 import shutil
+from dataclasses import replace
 
 import h5py
 import numpy as np
@@ -43,11 +44,13 @@ def run(objects, scans, scenes):
 
 
 @pytest.fixture(scope="module")
-def table8(run, tmp_path_factory):
-    """The folder in which Table 8 was run."""
-    folder = tmp_path_factory.mktemp("table8")
-    assert run(folder, "table8", "--limit", 3) == 0
-    return folder
+def short(run, tmp_path_factory):
+    """The folder in which an experiment was run, `short`: two rows of Table 8."""
+    folder = tmp_path_factory.mktemp("short")
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setitem(EXPERIMENTS, "short", replace(EXPERIMENTS["table8"], rows=EXPERIMENTS["table8"].rows[:2]))
+        assert run(folder, "short", "--limit", 3) == 0
+        yield folder
 
 
 def assert_complete(name, folder):
@@ -63,36 +66,36 @@ def assert_complete(name, folder):
         assert (folder / "runs" / "toy" / f"{name}.{suffix}").stat().st_size > 0
 
 
-def test_a_table_runs_from_end_to_end(table8):
-    assert_complete("table8", table8)
+def test_a_table_runs_from_end_to_end(short):
+    assert_complete("short", short)
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("name", [name for name in EXPERIMENTS if name != "table8"])
+@pytest.mark.parametrize("name", list(EXPERIMENTS))
 def test_an_experiment_runs_from_end_to_end(name, run, tmp_path, capsys):
     assert run(tmp_path, name, "--limit", 4) == 0, capsys.readouterr().out
     assert_complete(name, tmp_path)
 
 
-def test_recorded_pairs_and_methods_without_learning_by_a_network_that_another_table_trained(table8, run, monkeypatch, capsys):
+def test_recorded_pairs_and_methods_without_learning_by_a_network_that_another_table_trained(short, run, monkeypatch, capsys):
     regression, test = {"model.matching.head": "pcrnet"}, {"data.source": "stanford-scans"} | OBSERVED
     rows = (Row("PCRNet", "paper", regression, test), Row("PCRNet, then ICP", "paper", regression, test, then_icp=True))
     monkeypatch.setitem(EXPERIMENTS, "recorded", Experiment("range scans", NOISE, rows, baselines=True))
-    logs = {path: path.read_bytes() for path in table8.glob("runs/toy/*/log.jsonl")}
-    assert run(table8, "recorded", "--limit", 4) == 0, capsys.readouterr().out
-    assert_complete("recorded", table8)
-    assert {path: path.read_bytes() for path in table8.glob("runs/toy/*/log.jsonl")} == logs
+    logs = {path: path.read_bytes() for path in short.glob("runs/toy/*/log.jsonl")}
+    assert run(short, "recorded", "--limit", 4) == 0, capsys.readouterr().out
+    assert_complete("recorded", short)
+    assert {path: path.read_bytes() for path in short.glob("runs/toy/*/log.jsonl")} == logs
 
 
-def test_what_is_finished_is_not_done_again_and_what_is_missing_is(table8, run, tmp_path, capsys):
-    shutil.copytree(table8, tmp_path, dirs_exist_ok=True)
+def test_what_is_finished_is_not_done_again_and_what_is_missing_is(short, run, tmp_path, capsys):
+    shutil.copytree(short, tmp_path, dirs_exist_ok=True)
     folder = tmp_path / "runs" / "toy"
     logs = {path: path.read_bytes() for path in folder.glob("*/log.jsonl")}
-    first = json.loads((folder / "table8.json").read_text())
+    first = json.loads((folder / "short.json").read_text())
     lost = next(path.parent for path in logs if "pcrnet" in str(path))
     shutil.rmtree(lost)
-    assert run(tmp_path, "table8", "--limit", 3) == 0
-    again = json.loads((folder / "table8.json").read_text())
+    assert run(tmp_path, "short", "--limit", 3) == 0
+    again = json.loads((folder / "short.json").read_text())
     for before, after in zip(first["rows"], again["rows"], strict=True):
         expected, found = before["runs"][0]["metrics"], after["runs"][0]["metrics"]
         timed = "PCRNet" in before["label"]
@@ -103,9 +106,9 @@ def test_what_is_finished_is_not_done_again_and_what_is_missing_is(table8, run, 
         assert path.exists()
         assert path.parent == lost or path.read_bytes() == text
     capsys.readouterr()
-    assert run(tmp_path, "table8", "--limit", 3, "--only-collect") == 0
+    assert run(tmp_path, "short", "--limit", 3, "--only-collect") == 0
     assert "not run" not in capsys.readouterr().out
-    assert json.loads((folder / "table8.json").read_text())["rows"] == again["rows"]
+    assert json.loads((folder / "short.json").read_text())["rows"] == again["rows"]
 
 
 def test_data_that_is_not_given_leaves_a_row_empty_and_a_failure_is_shown(tmp_path, objects, monkeypatch, capsys):

@@ -26,6 +26,8 @@ from cmig_jax.training.state import abstract_state
 from cmig_jax.weights import PRETRAINED, check_variables, read_weights
 
 Floats = NDArray[np.float64]
+FINE = 0.1
+"""The reach of a refinement, of clouds in the unit sphere: points farther apart are no partners."""
 
 
 @dataclass(frozen=True)
@@ -113,7 +115,8 @@ def register(
         target: `[M, 3]`, in the same unit.
         network: of `load`; by default the one that comes with the package, which was trained on generated objects.
         points: points per cloud to keep at most; by default what the network was trained on. Larger clouds cost more.
-        refine: finish with point-to-point ICP on the whole clouds, which sharpens a good pose.
+        refine: finish with generalised ICP on the whole clouds, which sharpens a good pose. (For clouds that share their points, where
+            point-to-point ICP is exact, finish with `cmig_jax.baselines.icp`.)
 
     Returns:
         target_from_source, NumPy arrays R `[3, 3]` and t `[3]` in the unit of the clouds.
@@ -138,7 +141,7 @@ def register(
         pair["views"] = _views(pair, network.config)
     R, t = (np.asarray(v[0], np.float64) for v in network([pair]))
     if refine:
-        R, t = baselines.icp(x, y, max_distance=0.1, start=(R, t))
+        R, t = baselines.gicp(x, y, max_distance=FINE, start=(R, t))
     return RigidTransform(R=R, t=centre_y + scale * t - R @ centre_x)  # type: ignore[arg-type]
 
 

@@ -10,7 +10,7 @@ import pytest
 from cmig_jax.data.pairs import in_categories
 
 METRICS = {"rmse_r_deg", "mae_r_deg", "rmse_t", "mae_t", "iso_r_deg_median", "recall", "closest_point", "seconds_per_pair"}
-METHODS = {"identity", "ICP (cutoff 0.02)", "ICP (tuned)", "CMIGNet"}
+METHODS = {"identity", "ICP (cutoff 0.02)", "ICP (tuned)", "GICP", "CMIGNet", "CMIGNet + ICP", "CMIGNet + GICP"}
 REPORT = ["error_by_category.png", "error_vs_angle.png", "error_vs_overlap.png", "errors.png", "report.html"]
 
 

@@ -100,6 +100,26 @@ def icp(
     return _align(*clouds, "ICP", max_distance, iterations, tolerance, no_motion() if start is None else start)
 
 
+def gicp(
+    source: ArrayLike,
+    target: ArrayLike,
+    *,
+    max_distance: float | None,
+    neighbours: int = 20,
+    iterations: int = 200,
+    tolerance: float = 1e-6,
+    start: Pose | None = None,
+) -> Pose:
+    """Register by generalised ICP (small_gicp): every point has a covariance, so that planes slide on planes.
+
+    Clouds that were sampled on their own share a surface but no points, and there it is the more precise. Result and errors are those
+    of `icp`, and so are the arguments, but for `neighbours`, the points per covariance (the documentation's 20).
+    """
+    source, target = checked_cloud(source, "source"), checked_cloud(target, "target")
+    clouds = _with_covariances(source, neighbours), _with_covariances(target, neighbours)
+    return _align(*clouds, "GICP", max_distance, iterations, tolerance, no_motion() if start is None else start)
+
+
 @dataclass(frozen=True)
 class Identity:
     """No registration at all."""
@@ -157,10 +177,10 @@ ICP_TUNED = Icp()
 
 @dataclass(frozen=True)
 class Gicp:
-    """Generalised ICP (small_gicp): every point has a covariance, so that planes slide on planes.
+    """Generalised ICP, `gicp`, from the identity.
 
-    It is a method for fine registration and needs a start; like ICP it has none here but the identity. The documentation's 20
-    neighbours per covariance are kept, clouds this small are not thinned, and the rounds are those of `icp_tuned`.
+    It is a method for fine registration and needs a start; like ICP it has none here but the identity. Clouds this small are not
+    thinned, and the rounds are those of `icp_tuned`.
 
     Attributes:
         neighbours: points per covariance.
@@ -175,7 +195,8 @@ class Gicp:
 
     def register(self, source: ArrayLike, target: ArrayLike) -> Pose:
         """Register one pair; a round that finds no pose leaves the one it started from."""
-        clouds = self._with_covariances(checked_cloud(source, "source")), self._with_covariances(checked_cloud(target, "target"))
+        source, target = checked_cloud(source, "source"), checked_cloud(target, "target")
+        clouds = _with_covariances(source, self.neighbours), _with_covariances(target, self.neighbours)
         pose = no_motion()
         for max_distance in self.max_distances:
             pose = _align(*clouds, "GICP", max_distance, self.iterations, self.tolerance, pose)
@@ -186,10 +207,11 @@ class Gicp:
         """The package, the start and the fields."""
         return recorded(self, _package(), start="identity", threads=1)
 
-    def _with_covariances(self, points: Floats) -> small_gicp.PointCloud:
-        cloud = small_gicp.PointCloud(points)
-        small_gicp.estimate_covariances(cloud, num_neighbors=self.neighbours, num_threads=1)
-        return cloud
+
+def _with_covariances(points: Floats, neighbours: int) -> small_gicp.PointCloud:
+    cloud = small_gicp.PointCloud(points)
+    small_gicp.estimate_covariances(cloud, num_neighbors=neighbours, num_threads=1)
+    return cloud
 
 
 def _align(

@@ -13,6 +13,7 @@ from cmig_jax.data.pairs import SYMMETRIC
 from cmig_jax.experiments.__main__ import main
 from configs.experiments import EXPERIMENTS, NOISE, OBSERVED, Experiment, Row
 
+SHORT = {"model.fusion.image": "none", "loss.cross_modal": "off", "model.matching.iterations": 1}
 CATEGORIES = (*SYMMETRIC, "chair", "desk", "door", "sofa")
 
 
@@ -45,10 +46,11 @@ def run(objects, scans, scenes):
 
 @pytest.fixture(scope="module")
 def short(run, tmp_path_factory):
-    """The folder in which an experiment was run, `short`: two rows of Table 8."""
+    """The folder in which an experiment was run, `short`: two rows of Table 8, without images, which compiles sooner."""
     folder = tmp_path_factory.mktemp("short")
+    rows = tuple(replace(row, flags={**row.flags, **SHORT}) for row in EXPERIMENTS["table8"].rows[:2])
     with pytest.MonkeyPatch.context() as patch:
-        patch.setitem(EXPERIMENTS, "short", replace(EXPERIMENTS["table8"], rows=EXPERIMENTS["table8"].rows[:2]))
+        patch.setitem(EXPERIMENTS, "short", replace(EXPERIMENTS["table8"], rows=rows))
         assert run(folder, "short", "--limit", 3) == 0
         yield folder
 
@@ -78,7 +80,7 @@ def test_an_experiment_runs_from_end_to_end(name, run, tmp_path, capsys):
 
 
 def test_recorded_pairs_and_methods_without_learning_by_a_network_that_another_table_trained(short, run, monkeypatch, capsys):
-    regression, test = {"model.matching.head": "pcrnet"}, {"data.source": "stanford-scans"} | OBSERVED
+    regression, test = {"model.matching.head": "pcrnet", **SHORT}, {"data.source": "stanford-scans"} | OBSERVED
     rows = (Row("PCRNet", "paper", regression, test), Row("PCRNet, then ICP", "paper", regression, test, then_icp=True))
     monkeypatch.setitem(EXPERIMENTS, "recorded", Experiment("range scans", NOISE, rows, baselines=True))
     logs = {path: path.read_bytes() for path in short.glob("runs/toy/*/log.jsonl")}

@@ -36,7 +36,7 @@ class Row:
         preset: what the row starts from.
         flags: what it changes in training and test.
         test: what it changes at test only.
-        then_icp: whether point-to-point ICP finishes at test, as `evaluate.py` does beside the network alone.
+        then: what finishes at test, point-to-point or generalised ICP, as in `evaluate.py` beside the network alone.
         quoted: the paper's figures.
     """
 
@@ -44,7 +44,7 @@ class Row:
     preset: Preset
     flags: Flags = field(default_factory=dict)
     test: Flags = field(default_factory=dict)
-    then_icp: bool = False
+    then: Literal["ICP", "GICP"] | None = None
     quoted: Quoted | None = None
 
 
@@ -101,9 +101,13 @@ def _three_presets(quoted: Quoted | None = None, test: Flags = UNCHANGED) -> tup
 
 
 def _recorded(source: str) -> tuple[Row, ...]:
-    """The three presets on recorded pairs, and ours finished by ICP."""
+    """The three presets on recorded pairs, and ours finished by ICP and by generalised ICP."""
     test = {"data.source": source} | OBSERVED
-    return (*_three_presets(test=test), Row("corrected, then ICP", "corrected", test=test, then_icp=True))
+    return (
+        *_three_presets(test=test),
+        Row("corrected, then ICP", "corrected", test=test, then="ICP"),
+        Row("corrected, then GICP", "corrected", test=test, then="GICP"),
+    )
 
 
 FULL = Quoted(1.472, 0.632, 0.0058, 0.0036)
@@ -202,8 +206,8 @@ EXPERIMENTS: dict[str, Experiment] = {
             *(Row(f"released + {name} + all three at test", "released", flags, test=AT_TEST) for name, flags in CORRECTIONS.items()),
             Row("corrected without the three", "corrected", test=AS_TRAINED),
             Row("corrected", "corrected"),
-            Row("released, then ICP", "released", then_icp=True),
-            Row("corrected, then ICP", "corrected", then_icp=True),
+            Row("released, then ICP", "released", then="ICP"),
+            Row("corrected, then ICP", "corrected", then="ICP"),
         ),
         baselines=True,
     ),
@@ -217,10 +221,12 @@ EXPERIMENTS: dict[str, Experiment] = {
             Row("released, trained so", "released", {"data.sampling": "twice"}),
             Row("released, trained so, + all three at test", "released", {"data.sampling": "twice"}, test=AT_TEST),
             Row("corrected, trained so", "corrected", {"data.sampling": "twice"}),
-            Row("released, then ICP", "released", test={"data.sampling": "twice"}, then_icp=True),
-            Row("corrected, then ICP", "corrected", test={"data.sampling": "twice"}, then_icp=True),
-            Row("released, trained so, then ICP", "released", {"data.sampling": "twice"}, then_icp=True),
-            Row("corrected, trained so, then ICP", "corrected", {"data.sampling": "twice"}, then_icp=True),
+            Row("released, then ICP", "released", test={"data.sampling": "twice"}, then="ICP"),
+            Row("corrected, then ICP", "corrected", test={"data.sampling": "twice"}, then="ICP"),
+            Row("released, trained so, then ICP", "released", {"data.sampling": "twice"}, then="ICP"),
+            Row("corrected, trained so, then ICP", "corrected", {"data.sampling": "twice"}, then="ICP"),
+            Row("released, trained so, then GICP", "released", {"data.sampling": "twice"}, then="GICP"),
+            Row("corrected, trained so, then GICP", "corrected", {"data.sampling": "twice"}, then="GICP"),
         ),
         baselines=True,
     ),

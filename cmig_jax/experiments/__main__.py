@@ -75,7 +75,7 @@ def listing() -> list[str]:
     for name, experiment in EXPERIMENTS.items():
         lines += ["", f"{name}: {experiment.about}", f"  all rows: {_flags(experiment.protocol)}"]
         for row in experiment.rows:
-            at_test = (f"; at test {_flags(row.test)}" if row.test else "") + ("; then ICP" if row.then_icp else "")
+            at_test = (f"; at test {_flags(row.test)}" if row.test else "") + (f"; then {row.then}" if row.then else "")
             lines.append(f"  {row.label:26} {row.preset}: {_flags(row.flags)}{at_test}")
     return lines[1:]
 

@@ -47,7 +47,7 @@ class Job:
     def evaluation(self) -> str:
         """The folder of its results inside the run folder: one for each way of testing."""
         name = f"evaluation-{hashlib.sha256(to_json(self.test).encode()).hexdigest()[:8]}"
-        return f"{name}-then-icp" if self.row.then_icp else name
+        return f"{name}-then-{self.row.then.lower()}" if self.row.then else name
 
     def commands(self) -> tuple[str, str]:
         """Return what to type to train this network, and to evaluate it."""

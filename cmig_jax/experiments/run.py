@@ -111,7 +111,7 @@ def is_trained(run: Path, config: Config) -> bool:
 def _evaluate(job: Job, limit: int | None) -> dict[str, Any]:
     batch = job.training.optim.batch
     network = load(job.run, "best", batch, config=job.test)
-    method = methods_for(network)[f"{NETWORK} + ICP" if job.row.then_icp else NETWORK]
+    method = methods_for(network)[f"{NETWORK} + {job.row.then}" if job.row.then else NETWORK]
     folder = job.run / job.evaluation
     results = evaluate(
         pairs_to_test(job.test, limit), {NETWORK: method}, folder, command=job.commands()[1], config=_settings(job, limit), chunk=batch

@@ -51,7 +51,7 @@ def as_json(name: str, experiment: Experiment, results: Results) -> dict[str, An
                 "preset": row.preset,
                 "flags": dict(experiment.protocol) | dict(row.flags),
                 "test_flags": dict(row.test),
-                "then_icp": row.then_icp,
+                "then": row.then,
                 "quoted_from_the_paper": asdict(row.quoted) if row.quoted else None,
                 "runs": [
                     {"seed": o.job.seed, "commands": o.job.commands(), "metrics": o.metrics and dict(o.metrics), "problem": o.problem}

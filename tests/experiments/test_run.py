@@ -81,7 +81,7 @@ def test_an_experiment_runs_from_end_to_end(name, run, tmp_path, capsys):
 
 def test_recorded_pairs_and_methods_without_learning_by_a_network_that_another_table_trained(short, run, monkeypatch, capsys):
     regression, test = {"model.matching.head": "pcrnet", **SHORT}, {"data.source": "stanford-scans"} | OBSERVED
-    rows = (Row("PCRNet", "paper", regression, test), Row("PCRNet, then ICP", "paper", regression, test, then_icp=True))
+    rows = (Row("PCRNet", "paper", regression, test), Row("PCRNet, then GICP", "paper", regression, test, then="GICP"))
     monkeypatch.setitem(EXPERIMENTS, "recorded", Experiment("range scans", NOISE, rows, baselines=True))
     logs = {path: path.read_bytes() for path in short.glob("runs/toy/*/log.jsonl")}
     assert run(short, "recorded", "--limit", 4) == 0, capsys.readouterr().out

@@ -28,6 +28,9 @@ from cmig_jax.weights import PRETRAINED, check_variables, read_weights
 Floats = NDArray[np.float64]
 FINE = 0.1
 """The reach of a refinement, of clouds in the unit sphere: points farther apart are no partners."""
+DENSE = 300
+"""From so many points on, a point's 20 neighbours show its plane, and generalised ICP is more precise than ICP (384 points: recall 57 %
+against 41; 192: 61 against 68; 144: 31 against 42)."""
 
 
 @dataclass(frozen=True)
@@ -115,8 +118,8 @@ def register(
         target: `[M, 3]`, in the same unit.
         network: of `load`; by default the one that comes with the package, which was trained on generated objects.
         points: points per cloud to keep at most; by default what the network was trained on. Larger clouds cost more.
-        refine: finish with generalised ICP on the whole clouds, which sharpens a good pose. (For clouds that share their points, where
-            point-to-point ICP is exact, finish with `cmig_jax.baselines.icp`.)
+        refine: finish with generalised ICP on the whole clouds, or point-to-point ICP if one has fewer than `DENSE` points, which
+            sharpens a good pose. (For clouds that share their points, ICP is the better one, and `cmig_jax.baselines` has both.)
 
     Returns:
         target_from_source, NumPy arrays R `[3, 3]` and t `[3]` in the unit of the clouds.
@@ -141,7 +144,8 @@ def register(
         pair["views"] = _views(pair, network.config)
     R, t = (np.asarray(v[0], np.float64) for v in network([pair]))
     if refine:
-        R, t = baselines.gicp(x, y, max_distance=FINE, start=(R, t))
+        local = baselines.gicp if min(len(x), len(y)) >= DENSE else baselines.icp
+        R, t = local(x, y, max_distance=FINE, start=(R, t))
     return RigidTransform(R=R, t=centre_y + scale * t - R @ centre_x)  # type: ignore[arg-type]
 
 

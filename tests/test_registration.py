@@ -127,6 +127,23 @@ def test_refinement_sharpens_a_pose_that_is_close(network, clouds_of_two_sizes, 
     np.testing.assert_allclose(found.apply(source), target, atol=1e-3)
 
 
+def test_refinement_slides_planes_on_planes_where_clouds_are_dense(network, monkeypatch):
+    """Three faces of a cube, sampled twice and slightly apart: no two points belong together, but their planes do."""
+    monkeypatch.setattr(Network, "__call__", lambda self, pairs: (np.eye(3)[None], np.zeros((1, 3))))
+    shift = np.array([0.02, 0.01, 0.0])
+
+    def error(count):
+        def faces(seed):
+            points = np.random.default_rng(seed).uniform(0, 1, (count, 3))
+            points[np.arange(count), np.arange(count) % 3] = 0
+            return points
+
+        found = register(faces(0) - shift, faces(1), network, refine=True)
+        return np.abs(found.apply(faces(0) - shift) - faces(0)).max()
+
+    assert error(900) < 0.01 < error(90)
+
+
 @pytest.mark.parametrize("scale", [1e-6, 1e6])
 def test_refinement_does_not_depend_on_the_unit(network, clouds_of_two_sizes, monkeypatch, scale):
     monkeypatch.setattr(Network, "__call__", lambda self, pairs: (np.eye(3)[None], np.zeros((1, 3))))

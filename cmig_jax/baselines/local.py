@@ -210,6 +210,8 @@ class Gicp:
 
 
 def _with_covariances(points: Floats, neighbours: int) -> small_gicp.PointCloud:
+    if neighbours < 3:  # of none, small_gicp ends the process
+        raise ValueError(f"neighbours = {neighbours}: expected at least 3, which make a plane")
     cloud = small_gicp.PointCloud(points)
     small_gicp.estimate_covariances(cloud, num_neighbors=neighbours, num_threads=1)
     return cloud

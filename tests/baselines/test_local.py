@@ -111,3 +111,11 @@ def test_settings_out_of_range_are_refused(setting, surface):
         Gicp(max_distances=(setting["max_distance"],)).register(surface(20, 0), surface(20, 1))
     with pytest.raises(ValueError, match="iterations = 0"):
         icp(surface(10, 0), surface(10, 1), max_distance=None, iterations=0)
+
+
+@pytest.mark.parametrize("neighbours", [-1, 0, 2])
+def test_too_few_neighbours_for_a_plane_are_refused(neighbours, surface):
+    with pytest.raises(ValueError, match=f"neighbours = {neighbours}: expected at least 3"):
+        gicp(surface(20, 0), surface(20, 1), max_distance=None, neighbours=neighbours)
+    with pytest.raises(ValueError, match="expected at least 3"):
+        Gicp(neighbours=neighbours).register(surface(20, 0), surface(20, 1))

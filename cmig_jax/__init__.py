@@ -1,6 +1,7 @@
 """CMIGNet (Xie et al., RA-L 2023) in JAX and Flax: rigid registration of two partial point clouds, guided by depth images.
 
-`load` reads a trained network from a run folder and `register` aligns two clouds with it; `Config` holds the flags of a run.
+`load` reads a trained network from a run folder and `register` aligns two clouds with it, `python -m cmig_jax.align` two files;
+`Config` holds the flags of a run.
 `data` makes pairs (numpy only), `nn` is the network, `geometry` the pose solver and neighbours, `losses` and `metrics` judge a
 prediction, `training` brings them together, `evaluation` compares methods, `parity` compares numbers with PyTorch.
 """

@@ -11,6 +11,7 @@ from typing import Any, Literal
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
+from scipy.spatial.transform import Rotation
 
 from cmig_jax import baselines
 from cmig_jax.config import Config
@@ -143,6 +144,7 @@ def register(
     if uses_images(network.config):
         pair["views"] = _views(pair, network.config)
     R, t = (np.asarray(v[0], np.float64) for v in network([pair]))
+    R = Rotation.from_matrix(R).as_matrix()  # single precision's is a rotation to 1e-6 only
     if refine:
         local = baselines.gicp if min(len(x), len(y)) >= DENSE else baselines.icp
         R, t = local(x, y, max_distance=FINE, start=(R, t))
@@ -151,6 +153,8 @@ def register(
 
 def _cloud(points: ArrayLike, name: str, config: Config) -> Floats:
     """Check a user's cloud."""
+    if np.ma.is_masked(points):
+        raise ValueError(f"{name} has masked points: expected them to be left out")
     try:
         given = np.asarray(points)
     except ValueError as error:

@@ -117,6 +117,14 @@ def test_thinning_to_fewer_points_than_the_network_needs_is_refused(network, clo
         register(*clouds_of_two_sizes, network, points=points)
 
 
+def test_a_cloud_with_masked_points_is_refused(network, clouds_of_two_sizes):
+    source, target = clouds_of_two_sizes
+    hidden = np.ma.masked_array(source, np.arange(len(source))[:, None] % [9, 9, 9] == 0)
+    with pytest.raises(ValueError, match="source has masked points"):
+        register(hidden, target, network)
+    assert_rotation(register(np.ma.masked_array(source), target, network).R)
+
+
 def test_refinement_sharpens_a_pose_that_is_close(network, clouds_of_two_sizes, monkeypatch):
     monkeypatch.setattr(Network, "__call__", lambda self, pairs: (np.eye(3)[None], np.zeros((1, 3))))
     target = clouds_of_two_sizes[1]

@@ -21,7 +21,7 @@ _TEST_SHARE = 0.2
 
 
 def read_geometry(path: str | Path) -> trimesh.Trimesh | np.ndarray:
-    """Read a mesh, or points `[P, 3]` float32 (NPY; PLY without faces), as they stand in the file.
+    """Read a mesh, or points `[P, 3]` float64 (NPY; PLY without faces), as they stand in the file.
 
     Raises:
         ValueError: missing, truncated, of another format, or without a surface; the message names the file.

@@ -32,7 +32,7 @@ class RawObject:
     shuffled: bool = False
 
     def geometry(self) -> trimesh.Trimesh | np.ndarray:
-        """Read the geometry: a mesh with a surface, or finite points `[P, 3]` float32, in the units of its source.
+        """Read the geometry: a mesh with a surface, or finite points `[P, 3]` float64, in the units of its source.
 
         Raises:
             ValueError: unreadable, no faces, no area, no points, or coordinates that are not finite; the message names the object.
@@ -48,7 +48,7 @@ class RawObject:
 
     @property
     def points(self) -> np.ndarray | None:
-        """The geometry where it is a cloud `[P, 3]` float32, else None; read at every access."""
+        """The geometry where it is a cloud `[P, 3]` float64, else None; read at every access."""
         value = self.geometry()
         return None if isinstance(value, trimesh.Trimesh) else value
 
@@ -75,7 +75,7 @@ class Recording:
     Attributes:
         name: unique in its dataset.
         label: index into the categories of its dataset.
-        read: function without arguments that reads the cloud `[P, 3]` float32, in the units of the source.
+        read: function without arguments that reads the cloud `[P, 3]`, in the units of the source.
         world_from_sensor: `[4, 4]` float64, rigid, in the same units.
     """
 
@@ -134,7 +134,7 @@ def check_mesh(mesh: trimesh.Trimesh, name: object) -> trimesh.Trimesh:
 
 
 def check_points(points: np.ndarray, name: object) -> np.ndarray:
-    """Return finite points `[P, 3]`, P >= 1, as float32.
+    """Return finite points `[P, 3]`, P >= 1, as float64: in geographic coordinates single precision has decimetres.
 
     Raises:
         ValueError: another shape or kind of numbers, or coordinates that are not finite.
@@ -144,7 +144,7 @@ def check_points(points: np.ndarray, name: object) -> np.ndarray:
         raise ValueError(f"{name}: points of shape {points.shape}, {points.dtype}; expected [P, 3] numbers with P >= 1")
     if not np.isfinite(points).all():
         raise ValueError(f"{name}: {_not_finite(points)}; expected finite coordinates")
-    return points.astype(np.float32)
+    return points.astype(np.float64)
 
 
 def _not_finite(points: np.ndarray) -> str:

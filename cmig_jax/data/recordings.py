@@ -97,7 +97,7 @@ def read_manifest(folder: Path) -> dict[str, Any]:
 
 
 def read_recording(folder: Path, file: str) -> np.ndarray:
-    """Read a prepared cloud `[P, 3]` float32.
+    """Read a prepared cloud `[P, 3]`.
 
     Raises:
         ValueError: missing or damaged.
@@ -146,7 +146,7 @@ def _prepare(recorded: RecordedDataset, settings: dict[str, Any], folder: Path, 
         if not (folder / file).exists():
             cloud = check_points(recording.read(), recording.name)
             with replacing(folder / file) as opened:
-                np.save(opened, cloud)
+                np.save(opened, cloud.astype(np.float32))
     poses = [recording.world_from_sensor for recording in recorded.recordings]
     pairs = []
     for i, j in tqdm(recorded.candidates, "overlaps", unit="pair", disable=not progress):

@@ -121,7 +121,7 @@ def _scan(conf: Path, number: int, words: list[str]) -> tuple[Path, np.ndarray]:
 
 def _read_scan(path: Path) -> np.ndarray:
     geometry = read_geometry(path)
-    return np.asarray(geometry.vertices, np.float32) if isinstance(geometry, trimesh.Trimesh) else geometry
+    return np.asarray(geometry.vertices if isinstance(geometry, trimesh.Trimesh) else geometry, np.float32)
 
 
 def _fused(conf: Path) -> np.ndarray:

@@ -92,7 +92,7 @@ def test_hdf5_gives_every_row_of_every_file(hdf5):
     assert names[8:] == ["pack/a.obj", "pack/b.obj"]
     with h5py.File(hdf5 / "ply_data_train1.h5") as file:
         np.testing.assert_array_equal(dataset.objects[6].points, file["data"][1].astype(np.float32))
-    assert dataset.objects[6].points.dtype == np.float32
+    assert dataset.objects[6].points.dtype == np.float64
     assert all(item.mesh is None and item.shuffled for item in dataset.objects)
 
 
@@ -187,8 +187,8 @@ def test_clouds(tmp_path):
     trimesh.PointCloud(points).export(tmp_path / "b.ply")
     for name in ("a.npy", "b.ply"):
         cloud = read_geometry(tmp_path / name)
-        assert cloud.dtype == np.float32
-        np.testing.assert_allclose(cloud, points, atol=1e-6)
+        assert cloud.dtype == np.float64
+        np.testing.assert_array_equal(cloud, points)
 
 
 @pytest.mark.parametrize(

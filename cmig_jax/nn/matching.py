@@ -22,6 +22,7 @@ from cmig_jax.nn.tower import Tower, chunks_of, joined
 from cmig_jax.structs import RigidTransform
 
 CREDIBILITY_WIDTH = 32
+COORDINATES = 3
 
 
 @struct.dataclass
@@ -110,8 +111,10 @@ class PCRNetHead(nn.Module):
 class PairLayer(nn.Module):
     """The first layer over pairs: a matrix W on `[d, (b_j - a_i) / (d + 1e-8), extra_i]`, d = |b_j - a_i|, without bias.
 
-    W's middle part is applied to each cloud and the difference taken afterwards: two products per point instead of one per pair.
-    `reverse` takes a_i - b_j, as the reference does for coordinates.
+    Of features, W's middle part is applied to each cloud and the difference taken afterwards: two products per point instead of one
+    per pair. Coordinates are subtracted first: a source that the pose has brought onto the target is 1e-7 from it, and what rounding
+    leaves of the difference of two products, divided by that, would swamp the batch statistics. `reverse` takes a_i - b_j, as the
+    reference does for coordinates.
     """
 
     features: int
@@ -125,16 +128,20 @@ class PairLayer(nn.Module):
         kernel = self.param("kernel", torch_kernel, (1 + C + E, self.features))
         dtype, wide = self.dtype or kernel.dtype, kernel.dtype
         length, direction, rest = jnp.split(kernel.astype(dtype), (1, 1 + C))
-        centre = jnp.mean(b, axis=-2, keepdims=True)  # cancels in the difference, and would cost it digits
-        row, column = (((x - centre).astype(dtype) @ direction).astype(wide) for x in (a, b))
         distance = pair_distances(a, b)
         # No length, no direction: 1e-8 would blow up what rounding leaves of the difference.
         scale = jnp.where(distance > 0, 1 / (distance + 1e-8), 0)
-        terms = (
-            PairTerm(distance, None, length.astype(wide)[None]),
-            PairTerm(-scale if self.reverse else scale, -row, column),
-        )
-        return PairSum(jnp.zeros_like(row) if extra is None else (extra.astype(dtype) @ rest).astype(wide), terms)
+        scale = -scale if self.reverse else scale
+        terms = (PairTerm(distance, None, length.astype(wide)[None]),)
+        if C <= COORDINATES:
+            unit = (b[:, None] - a[:, :, None]) * scale[..., None]
+            terms += tuple(PairTerm(unit[..., c], None, direction.astype(wide)[None, c : c + 1]) for c in range(C))
+        else:
+            centre = jnp.mean(b, axis=-2, keepdims=True)  # cancels in the difference, and would cost it digits
+            row, column = (((x - centre).astype(dtype) @ direction).astype(wide) for x in (a, b))
+            terms += (PairTerm(scale, -row, column),)
+        own = jnp.zeros((*a.shape[:2], self.features), wide) if extra is None else (extra.astype(dtype) @ rest).astype(wide)
+        return PairSum(own, terms)
 
 
 class Credibility(nn.Module):
@@ -172,7 +179,7 @@ def pair_distances(a: Array, b: Array) -> Array:
     Coordinates are subtracted; for features that would be a tensor of C numbers per pair, so their distances come from products,
     and count as 0 below what rounding leaves of them.
     """
-    if a.shape[-1] <= 3:
+    if a.shape[-1] <= COORDINATES:
         square = jnp.sum((a[:, :, None] - b[:, None]) ** 2, axis=-1)
         zero = square == 0
     else:

@@ -47,23 +47,22 @@ class PairSum:
 
     def moments(self) -> Moments:
         """Take mean and variance per channel from sums over points; everything is centred first, so that squares keep their digits."""
-        B, N, M = self.terms[0].scale.shape
-        row, column, terms = self.row, jnp.zeros((B, M, self.row.shape[-1]), self.row.dtype), []
+        row, column, terms = self.row, jnp.zeros_like(self.row[:1, :1]), []
         for t in self.terms:
-            a, b = jnp.zeros_like(row) if t.row is None else t.row, jnp.broadcast_to(t.column, column.shape)
             middle = jnp.mean(t.scale)
-            row, column = row + middle * a, column + middle * b
-            terms.append((t.scale - middle, a, b))
+            row = row if t.row is None else row + middle * t.row
+            column = column + middle * t.column
+            terms.append(PairTerm(t.scale - middle, t.row, t.column))
         means = [jnp.mean(x, axis=(0, 1), keepdims=True) for x in (row, column)]
-        terms.append((jnp.ones((B, N, M), row.dtype), row - means[0], column - means[1]))
+        terms.append(PairTerm(jnp.ones_like(terms[0].scale), row - means[0], column - means[1]))
         first, second = jnp.zeros_like(row[0, 0]), jnp.zeros_like(row[0, 0])
-        for scale, a, b in terms:
-            first += _weighted(scale, a, b)
-            for other, c, d in terms:
-                product = scale * other
-                mixed = jnp.einsum("bnm,bmc->bnc", product, d, precision=HIGHEST)
-                second += _weighted(product, a * c, b * d) + 2 * jnp.sum(a * mixed, axis=(0, 1))
-        mean, count = first / (B * N * M), B * N * M
+        for i, one in enumerate(terms):
+            first += _total(one)
+            second += _product_of(one, one)
+            for other in terms[:i]:
+                second += 2 * _product_of(one, other)
+        count = terms[0].scale.size
+        mean = first / count
         return Moments(mean=mean + (means[0] + means[1])[0, 0], variance=second / count - mean**2, count=count)
 
     def normalised(self, affine: Affine) -> PairSum:
@@ -71,10 +70,31 @@ class PairSum:
         return PairSum(affine(self.row), tuple(t.times(affine.scale) for t in self.terms))
 
 
-def _weighted(weight: Array, row: Array, column: Array) -> Array:
-    """Sum `weight_ij (row_i + column_j)` over pairs, `[C]`."""
-    of_row, of_column = jnp.sum(weight, axis=2)[..., None], jnp.sum(weight, axis=1)[..., None]
-    return jnp.sum(of_row * row, axis=(0, 1)) + jnp.sum(of_column * column, axis=(0, 1))
+def _total(term: PairTerm) -> Array:
+    """Sum a term over pairs, `[C]`."""
+    if term.column.shape[0] == term.column.shape[1] == 1:
+        total = jnp.sum(term.scale) * term.column[0, 0]
+    else:
+        total = jnp.sum(jnp.sum(term.scale, axis=1)[..., None] * term.column, axis=(0, 1))
+    return total if term.row is None else total + jnp.sum(jnp.sum(term.scale, axis=2)[..., None] * term.row, axis=(0, 1))
+
+
+def _product_of(one: PairTerm, other: PairTerm) -> Array:
+    """Sum the product of two terms over pairs, `[C]`."""
+    both = one.scale * other.scale
+    rows = None if one.row is None or other.row is None else one.row * other.row
+    total = _total(PairTerm(both, rows, one.column * other.column))
+    for row, column in ((one.row, other.column), (other.row, one.column)):
+        if row is not None:
+            total = total + jnp.sum(row * _over_columns(both, column), axis=(0, 1))
+    return total
+
+
+def _over_columns(weight: Array, column: Array) -> Array:
+    """Sum `weight_ij column_j` over columns, `[B, N, C]`."""
+    if column.shape[0] == column.shape[1] == 1:
+        return jnp.sum(weight, axis=2)[..., None] * column
+    return jnp.einsum("bnm,bmc->bnc", weight, column, precision=HIGHEST)
 
 
 @jax.custom_vjp

@@ -94,6 +94,19 @@ def test_nearly_equal_features_have_no_direction_larger_than_one(nearly):
     assert np.abs(np.diagonal(pairs, axis1=1, axis2=2)).max() < np.linalg.norm(kernel, axis=0).max()
 
 
+@pytest.mark.parametrize("gap", [1e-2, 1e-5, 1e-7])
+def test_statistics_keep_their_digits_where_the_pose_has_brought_points_onto_their_partners(gap):
+    b, kernel = normal(2, 20, 3).astype(np.float32), normal(7, 8, seed=1).astype(np.float32)
+    a = (b + gap * normal(2, 20, 3, seed=2)).astype(np.float32)
+    batch = PairLayer(8, reverse=True).apply({"params": {"kernel": kernel}}, a, b, a).moments()
+    difference = a.astype(np.float64)[:, :, None] - b[:, None]
+    length = np.linalg.norm(difference, axis=-1, keepdims=True)
+    inputs = np.concatenate([length, difference / (length + 1e-8), np.broadcast_to(a[:, :, None], difference.shape)], -1)
+    pairs = inputs @ kernel.astype(np.float64)
+    np.testing.assert_allclose(batch.mean, pairs.mean(axis=(0, 1, 2)), atol=1e-5)
+    np.testing.assert_allclose(batch.variance, pairs.var(axis=(0, 1, 2)), rtol=1e-5)
+
+
 def direct(name, variables, source, target, train):
     """Compute a head from the tensors of all pairs; return feature similarity, coordinate similarity (or None) and logit."""
     p, stats = variables["params"], variables["batch_stats"]

@@ -36,8 +36,7 @@ class Checkpoints:
 
     def save(self, step: int, state: Any, iterator: dict[str, Any], measures: dict[str, float] | None = None) -> None:
         """Save the state after `step` steps with the input pipeline's position and, at the end of an epoch, validation measures."""
-        latest = self._checkpointer.latest
-        if latest is not None and latest.step == step:
+        if self.last == step:
             return
         self._checkpointer.save(step, state, metrics=measures, custom_metadata={"iterator": iterator}, force=True)
 
@@ -49,6 +48,12 @@ class Checkpoints:
         where = f"{self._folder}, step {latest.step}"
         iterator = _read(where, lambda: self._checkpointer.metadata(latest.step).custom_metadata["iterator"])
         return _read(where, lambda: self._checkpointer.load(latest.step, like)), iterator
+
+    @property
+    def last(self) -> int | None:
+        """The step of the last checkpoint, None where there is none."""
+        latest = self._checkpointer.latest
+        return None if latest is None else latest.step
 
     def close(self) -> None:
         """Finish writing."""

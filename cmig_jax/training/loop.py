@@ -191,7 +191,9 @@ class _Run:
         path = self.folder / f"not-finite-step-{step}{share}.npz"
         np.savez(path, **arrays)  # pyright: ignore[reportArgumentType]
         bad = ", ".join(f"{name} = {value}" for name, value in values.items() if not np.isfinite(value))
-        raise NonFiniteLoss(f"step {step}: {bad}; the batch is in {path}, the last good state in the checkpoints")
+        last = self.checkpoints.last
+        saved = "there is no checkpoint yet" if last is None else f"the last checkpoint is of step {last}"
+        raise NonFiniteLoss(f"step {step}: {bad}; the batch is in {path}; {saved}")
 
 
 @contextmanager

@@ -57,7 +57,12 @@ def test_no_repetitions_is_an_error():
 
 
 @pytest.mark.parametrize(
-    ("flags", "message"), [(["--clouds", "3"], "--clouds 3: expected at least 256"), (["--device", "gpu"], "finds none")]
+    ("flags", "message"),
+    [
+        (["--clouds", "3"], "--clouds 3: expected at least 256"),
+        (["--json", "none/a.json"], "--json none/a.json: expected a file in a folder that is there"),
+        (["--device", "gpu"], "finds none"),
+    ],
 )
 def test_what_cannot_be_measured_is_one_line_of_error(flags, message):
     if "gpu" in flags and has_gpu():

@@ -17,6 +17,7 @@ from cmig_jax.bench.clouds import measure_clouds
 from cmig_jax.bench.run import run
 from cmig_jax.compilation import keep_compiled_programs
 from cmig_jax.config import ComputeConfig
+from cmig_jax.training.checkpoint import write_atomically
 
 DEFAULT = ComputeConfig()
 
@@ -48,6 +49,8 @@ def main(
         sys.exit(f"error: --repetitions {repetitions}: expected at least 1")
     if clouds and min(clouds) < (fewest := CASES["points"].sizes.keypoints):
         sys.exit(f"error: --clouds {min(clouds)}: expected at least {fewest} points, the network's keypoints")
+    if json is not None and not json.parent.is_dir():
+        sys.exit(f"error: --json {json}: expected a file in a folder that is there")
     if device == "gpu" and not has_gpu():
         sys.exit("error: --device gpu: JAX finds none here")
     if clouds:
@@ -62,7 +65,7 @@ def main(
             print("\n".join(case_lines(name, results[name])), flush=True)
     if json is not None:
         header = {"device": device, "repetitions": repetitions, "compute": dataclasses.asdict(compute), "jax": jax.__version__}
-        json.write_text(serialiser.dumps(header | results, indent=1) + "\n")
+        write_atomically(json, serialiser.dumps(header | results, indent=1) + "\n")
 
 
 def has_gpu() -> bool:

@@ -4,12 +4,11 @@ from __future__ import annotations
 
 from pathlib import Path
 
-from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 
 from cmig_jax.experiments.run import Results
 from cmig_jax.experiments.table import spread
-from cmig_jax.report.plots import DPI, FAINT, INK, SOURCE, TARGET
+from cmig_jax.report.plots import FAINT, INK, SOURCE, TARGET, save
 
 PANELS = (("rmse_r_deg", "RMSE(R), degrees", TARGET), ("mae_r_deg", "MAE(R), degrees", SOURCE))
 
@@ -24,11 +23,10 @@ def plot_rows(name: str, results: Results, path: Path) -> None:
     """
     labels = list(dict.fromkeys(outcome.job.row.label for outcome in results.outcomes if outcome.metrics))
     figure = Figure(figsize=(8.5, 1.1 + 0.34 * len(labels)), layout="constrained")
-    FigureCanvasAgg(figure)
     for axes, (key, heading, colour) in zip(figure.subplots(1, 2, sharey=True), PANELS, strict=True):
         for height, label in enumerate(labels):
             values = [o.metrics[key] for o in results.outcomes if o.metrics and o.job.row.label == label]
-            axes.plot(values, [height] * len(values), "o", color=colour, markersize=5, alpha=0.75)
+            axes.plot(values, [height] * len(values), "o", color=colour, markersize=5, alpha=0.75, clip_on=False)
             axes.vlines(spread(values)[0], height - 0.28, height + 0.28, color=INK, linewidth=1.5)
         axes.set_xlim(left=0)
         axes.set_ylim(len(labels) - 0.5, -0.5)
@@ -37,4 +35,4 @@ def plot_rows(name: str, results: Results, path: Path) -> None:
         axes.grid(axis="x", color=FAINT, alpha=0.3)
         axes.spines[["top", "right"]].set_visible(False)
     figure.suptitle(name, color=INK, fontsize=11)
-    figure.savefig(path, dpi=DPI)
+    save(figure, path)

@@ -12,6 +12,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from cmig_jax.training.checkpoint import write_atomically
+
 OUTPUT_BOUND = 1e-8  # float64: features, losses, poses
 STATE_BOUND = 1e-6  # float64: gradients, running statistics, parameters
 STAGE_BOUND = 1e-4  # float32: a stage fed the reference's input
@@ -92,4 +94,4 @@ def write_json(path: Path, header: dict[str, Any], rows: Sequence[Row]) -> None:
         return value if math.isfinite(value) else None
 
     listed = [vars(row) | {"absolute": number(row.absolute), "relative": number(row.relative), "holds": row.holds} for row in rows]
-    path.write_text(json.dumps(header | {"holds": all(row.holds for row in rows), "rows": listed}, indent=1) + "\n")
+    write_atomically(path, json.dumps(header | {"holds": all(row.holds for row in rows), "rows": listed}, indent=1) + "\n")

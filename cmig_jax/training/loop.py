@@ -21,7 +21,7 @@ from cmig_jax.config import Config
 from cmig_jax.data.loader import BatchIterator, epoch_steps, training_batches
 from cmig_jax.data.pairs import Pair, Pairs, in_categories, split_validation
 from cmig_jax.data.prepare import ensure_prepared
-from cmig_jax.data.shards import Shards, check_settings
+from cmig_jax.data.shards import Shards, check_settings, replacing
 from cmig_jax.metrics import registration_metrics
 from cmig_jax.nn.build import build, uses_images
 from cmig_jax.training.checkpoint import MEASURE, Checkpoints, check_config, write_config
@@ -189,7 +189,8 @@ class _Run:
             return
         share = "" if jax.process_count() == 1 else f"-process-{jax.process_index()}"
         path = self.folder / f"not-finite-step-{step}{share}.npz"
-        np.savez(path, **arrays)  # pyright: ignore[reportArgumentType]
+        with replacing(path) as file:
+            np.savez(file, **arrays)  # pyright: ignore[reportArgumentType]
         bad = ", ".join(f"{name} = {value}" for name, value in values.items() if not np.isfinite(value))
         last = self.checkpoints.last
         saved = "there is no checkpoint yet" if last is None else f"the last checkpoint is of step {last}"

@@ -9,7 +9,7 @@ from scipy.spatial.transform import Rotation
 from cmig_jax.align import main
 
 FAR = np.array([500_000.0, 4_000_000.0, 100.0])
-"""Where geographic coordinates are: single precision has half a metre there."""
+"""Where geographic coordinates are, in metres: single precision has a quarter of one there."""
 
 
 @pytest.fixture(scope="module")
@@ -21,7 +21,7 @@ def run(trained):
 
 @pytest.fixture(scope="module")
 def moved():
-    """A cloud of three planes, and the same moved by a little, so that refinement finds it whatever the network says."""
+    """A cloud of three planes, metres wide, and the same moved by a little."""
     rng = np.random.default_rng(0)
     cloud = rng.uniform(-1, 1, (600, 3)) * [4, 3, 2]
     cloud[np.arange(600), np.arange(600) % 3] = 0  # three planes

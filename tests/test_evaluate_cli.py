@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 
 from cmig_jax.data.pairs import in_categories
+from cmig_jax.training.checkpoint import validation_error
 
 METRICS = {"rmse_r_deg", "mae_r_deg", "rmse_t", "mae_t", "iso_r_deg_median", "recall", "closest_point", "seconds_per_pair"}
 METHODS = {"identity", "ICP (cutoff 0.02)", "ICP (tuned)", "GICP", "CMIGNet", "CMIGNet + ICP", "CMIGNet + GICP"}
@@ -47,7 +48,7 @@ def test_results_hold_what_made_them(results, evaluated, tiny):
     assert results["command"] == f"python evaluate.py {evaluated[0]} --limit 4 --batch 4 --report --report-pairs 3"
     assert results["config"]["data"]["points"] == tiny.data.points
     validated = [json.loads(line) for line in (evaluated[0] / "log.jsonl").read_text().splitlines() if "val_rmse_r_deg" in line]
-    best = min(validated, key=lambda line: line["val_rmse_r_deg"])
+    best = min(validated, key=validation_error)
     assert results["config"]["checkpoint"] == {"which": "best", "step": best["step"]}
 
 

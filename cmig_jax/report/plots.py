@@ -244,10 +244,10 @@ def _draw_errors(axes: Axes, lines: Sequence[Mapping[str, Any]]) -> None:
             steps, values = np.array(found).T
             axes.plot(steps, values, color=colour, lw=1.6, marker="o", ms=3, label=label)
             if key == "val_rmse_r_deg" and np.isfinite(values).any():
-                best = int(np.nanargmin(values))
-                axes.axhline(values[best], color=colour, lw=0.8, ls=":")
+                lowest = int(np.nanargmin(values))
+                axes.axhline(values[lowest], color=colour, lw=0.8, ls=":")
                 style: dict[str, Any] = {"textcoords": "offset points", "ha": "left", "va": "top", "color": colour, "fontsize": 8}
-                axes.annotate(f"best {values[best]:.2f}", (0, values[best]), (4, -2), xycoords=("axes fraction", "data"), **style)
+                axes.annotate(f"lowest {values[lowest]:.2f}", (0, values[lowest]), (4, -2), xycoords=("axes fraction", "data"), **style)
     axes.set_ylim(bottom=0)
     _finish_panel(axes, "validation error [deg]")
 

@@ -9,7 +9,7 @@ import logging
 import math
 import os
 import sys
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Mapping
 from pathlib import Path
 from typing import Any, Literal, TypeVar
 
@@ -17,7 +17,6 @@ from orbax.checkpoint import v1 as ocp
 
 from cmig_jax.config import Config, from_json, to_json
 
-MEASURE = "val_rmse_r_deg"  # what the best checkpoint is chosen by
 FREE = ("name", "data.root", "data.prepared", "compute.recompute", "compute.rows")
 """Flags that a run may change where it continues: they change where things are and how they are computed, not what."""
 
@@ -60,8 +59,19 @@ class Checkpoints:
         self._checkpointer.close()
 
 
-def _rank(metrics: Any) -> float:
-    return -metrics[MEASURE] if metrics and MEASURE in metrics else -math.inf
+def validation_error(measures: Mapping[str, float] | None) -> float:
+    """Return what the best checkpoint is chosen by: the mean angle (radians) plus the mean length of the motion to the true pose.
+
+    No point of the unit sphere is farther than this, on average, from where it belongs. RMSE(R) alone knows nothing of the translation,
+    and a few pairs decide it. Infinite where nothing was measured.
+    """
+    if not measures or not {"val_iso_r_deg_mean", "val_iso_t_mean"} <= set(measures):
+        return math.inf
+    return math.radians(measures["val_iso_r_deg_mean"]) + measures["val_iso_t_mean"]
+
+
+def _rank(measures: Any) -> float:
+    return -validation_error(measures)
 
 
 def write_config(run: Path, config: Config) -> None:

@@ -24,7 +24,7 @@ from cmig_jax.data.prepare import ensure_prepared
 from cmig_jax.data.shards import Shards, check_settings, replacing
 from cmig_jax.metrics import registration_metrics
 from cmig_jax.nn.build import build, uses_images
-from cmig_jax.training.checkpoint import MEASURE, Checkpoints, check_config, write_config
+from cmig_jax.training.checkpoint import Checkpoints, check_config, write_config
 from cmig_jax.training.logs import Log, NoLog
 from cmig_jax.training.mesh import device_mesh, to_device
 from cmig_jax.training.optim import optimizer, schedule
@@ -178,7 +178,7 @@ class _Run:
         measures = {f"val_{name}": value for name, value in registration_metrics(*found, *true).items()}
         log.write(self.step, measures | self._position(self.step))
         epoch = self.step // self.epoch_steps
-        log.say(f"epoch {epoch}: validation RMSE(R) {measures[MEASURE]:.2f} deg, recall {measures['val_recall']:.2f}")
+        log.say(f"epoch {epoch}: validation RMSE(R) {measures['val_rmse_r_deg']:.2f} deg, recall {measures['val_recall']:.2f}")
         self._save(measures)
 
     def _save(self, measures: dict[str, float] | None) -> None:

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from cmig_jax.config import Config
-from cmig_jax.training.checkpoint import MEASURE, Checkpoints, differences, is_validated, load_state, read_config, write_config
+from cmig_jax.training.checkpoint import Checkpoints, differences, is_validated, load_state, read_config, validation_error, write_config
 from cmig_jax.training.mesh import device_mesh, replicated
 from cmig_jax.training.state import TrainState
 
@@ -32,11 +32,15 @@ def abstract(devices=1, width=3):
     return jax.tree.map(lambda x: jax.ShapeDtypeStruct(x.shape, x.dtype, sharding=x.sharding), make_state(0, devices, width))
 
 
+def measured(error):
+    return None if error is None else {"val_iso_r_deg_mean": error, "val_iso_t_mean": 0.1}
+
+
 def save(run, measures, devices=1):
-    """Save states of steps 10, 20, ... with these validation errors (None: not validated)."""
+    """Save states of steps 10, 20, ... with these mean angles on validation (None: not validated)."""
     checkpoints = Checkpoints(run)
     for i, error in enumerate(measures, start=1):
-        checkpoints.save(10 * i, make_state(10 * i, devices), POSITION, None if error is None else {MEASURE: error})
+        checkpoints.save(10 * i, make_state(10 * i, devices), POSITION, measured(error))
     checkpoints.close()
 
 
@@ -67,6 +71,14 @@ def test_the_best_on_validation_and_the_last_are_kept(tmp_path):
     assert kept == [20, 50]
     assert_is(load_state(tmp_path, abstract()), 20)
     assert_is(load_state(tmp_path, abstract(), "last"), 50)
+
+
+def test_the_best_has_the_smallest_motion_to_the_true_pose_not_the_smallest_angle_alone():
+    turned = {"val_rmse_r_deg": 7.2, "val_iso_r_deg_mean": 10.1, "val_iso_t_mean": 0.046}
+    shifted = {"val_rmse_r_deg": 6.9, "val_iso_r_deg_mean": 9.8, "val_iso_t_mean": 0.065}
+    assert validation_error(turned) < validation_error(shifted)
+    assert validation_error(turned) == pytest.approx(np.deg2rad(10.1) + 0.046)
+    assert validation_error(None) == validation_error({"val_rmse_r_deg": 1.0}) == np.inf
 
 
 def test_a_run_that_was_never_validated_has_its_last_state(tmp_path):

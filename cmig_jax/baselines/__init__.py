@@ -12,7 +12,20 @@ from typing import Any
 
 from cmig_jax.baselines.fpfh import FastGlobal, FpfhRansac, load_open3d
 from cmig_jax.baselines.kiss import KissMatcher, load_kiss_matcher
-from cmig_jax.baselines.local import ICP_CUTOFF, ICP_TUNED, Gicp, Icp, Identity, gicp, icp, icp_cutoff, icp_tuned, identity
+from cmig_jax.baselines.local import (
+    ICP_CUTOFF,
+    ICP_TUNED,
+    Gicp,
+    Icp,
+    Identity,
+    finish_by_gicp,
+    finish_by_icp,
+    gicp,
+    icp,
+    icp_cutoff,
+    icp_tuned,
+    identity,
+)
 from cmig_jax.baselines.method import Baseline, Pose
 
 __all__ = [
@@ -25,6 +38,8 @@ __all__ = [
     "KissMatcher",
     "Pose",
     "classical",
+    "finish_by_gicp",
+    "finish_by_icp",
     "gicp",
     "icp",
     "icp_cutoff",

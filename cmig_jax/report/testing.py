@@ -19,7 +19,7 @@ from cmig_jax.data.recordings import ensure_recordings
 from cmig_jax.data.shards import Shards, check_settings
 from cmig_jax.evaluation import ERRORS, Method, evaluate, one_by_one
 from cmig_jax.nn.build import uses_images
-from cmig_jax.registration import FINE, Network, load
+from cmig_jax.registration import Network, load
 from cmig_jax.report.errors import Errors, read_errors
 from cmig_jax.report.figures import write_figures
 from cmig_jax.report.gallery import Example, choose
@@ -102,15 +102,15 @@ def methods_for(network: Network) -> dict[str, Method]:
     classical: dict[str, Method] = {name: one_by_one(method.register) for name, method in baselines.classical().items()}
     return classical | {
         NETWORK: lambda pairs: network([dict(pair) for pair in pairs]),
-        f"{NETWORK} + ICP": lambda pairs: refined(network, [dict(pair) for pair in pairs], baselines.icp),
-        f"{NETWORK} + GICP": lambda pairs: refined(network, [dict(pair) for pair in pairs], baselines.gicp),
+        f"{NETWORK} + ICP": lambda pairs: refined(network, [dict(pair) for pair in pairs], baselines.finish_by_icp),
+        f"{NETWORK} + GICP": lambda pairs: refined(network, [dict(pair) for pair in pairs], baselines.finish_by_gicp),
     }
 
 
-def refined(network: Network, pairs: Sequence[Pair], method: Callable[..., baselines.Pose]) -> tuple[np.ndarray, np.ndarray]:
-    """Register pairs by the network, then from its poses by a local method, `baselines.icp` or `gicp`: R `[n, 3, 3]`, t `[n, 3]`."""
+def refined(network: Network, pairs: Sequence[Pair], finish: Callable[..., baselines.Pose]) -> tuple[np.ndarray, np.ndarray]:
+    """Register pairs by the network, then from its poses by a finish, `baselines.finish_by_icp` or `_gicp`: R `[n, 3, 3]`, t `[n, 3]`."""
     starts = zip(*network(pairs), strict=True)
-    poses = [method(p["source"], p["target"], max_distance=FINE, start=start) for p, start in zip(pairs, starts, strict=True)]
+    poses = [finish(p["source"], p["target"], start) for p, start in zip(pairs, starts, strict=True)]
     return np.stack([R for R, _ in poses]), np.stack([t for _, t in poses])
 
 

@@ -11,7 +11,7 @@ from cmig_jax.data.pairs import in_categories
 from cmig_jax.training.checkpoint import validation_error
 
 METRICS = {"rmse_r_deg", "mae_r_deg", "rmse_t", "mae_t", "iso_r_deg_median", "recall", "closest_point", "seconds_per_pair"}
-METHODS = {"identity", "ICP (cutoff 0.02)", "ICP (tuned)", "GICP", "CMIGNet", "CMIGNet + ICP", "CMIGNet + GICP"}
+METHODS = {"identity", "ICP (cutoff 0.02)", "ICP (tuned)", "ICP (mean pose)", "GICP", "CMIGNet", "CMIGNet + ICP", "CMIGNet + GICP"}
 REPORT = ["error_by_category.png", "error_vs_angle.png", "error_vs_overlap.png", "errors.png", "report.html"]
 
 

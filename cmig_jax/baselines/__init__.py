@@ -1,6 +1,6 @@
 """Registration without learning, to compare the network with (Sec. IV-A), every method with the settings it runs with.
 
-`classical` lists the methods: `local` has those that start from the identity (ICP, generalised ICP), `fpfh` and `kiss` the global ones,
+`classical` lists the methods: `local` has those that need a start (ICP, generalised ICP), `fpfh` and `kiss` the global ones,
 which come with the extra `[baselines]`; `missing` says which are not there, and what brings them. Every method takes a source `[N, 3]`
 and a target `[M, 3]` and returns `target_from_source`: R `[3, 3]`, t `[3]`, float64.
 """
@@ -17,6 +17,7 @@ from cmig_jax.baselines.local import (
     ICP_TUNED,
     Gicp,
     Icp,
+    IcpFromMean,
     Identity,
     finish_by_gicp,
     finish_by_icp,
@@ -34,6 +35,7 @@ __all__ = [
     "FpfhRansac",
     "Gicp",
     "Icp",
+    "IcpFromMean",
     "Identity",
     "KissMatcher",
     "Pose",
@@ -51,9 +53,19 @@ __all__ = [
 INSTALL = "pip install -e '.[baselines]'"
 
 
-def classical() -> dict[str, Baseline]:
-    """Return the methods without learning by the name of their row: the core's, and those of the extra that can be imported."""
-    rows: dict[str, Baseline] = {"identity": Identity(), "ICP (cutoff 0.02)": ICP_CUTOFF, "ICP (tuned)": ICP_TUNED, "GICP": Gicp()}
+def classical(mean_angle_deg: float = 0.0) -> dict[str, Baseline]:
+    """Return the methods without learning by the name of their row: the core's, and those of the extra that can be imported.
+
+    Args:
+        mean_angle_deg: what the row "ICP (mean pose)" is told of the protocol, `data.pairs.mean_angle_deg`.
+    """
+    rows: dict[str, Baseline] = {
+        "identity": Identity(),
+        "ICP (cutoff 0.02)": ICP_CUTOFF,
+        "ICP (tuned)": ICP_TUNED,
+        "ICP (mean pose)": IcpFromMean(mean_angle_deg),
+        "GICP": Gicp(),
+    }
     absent = missing()
     return rows | {name: method for name, (method, _) in _extra().items() if name not in absent}
 

@@ -1,4 +1,4 @@
-"""Local methods, which start from the identity (Sec. IV-A): the identity itself, point-to-point ICP and generalised ICP (small_gicp).
+"""Local methods (Sec. IV-A): the identity, and from it, or from a start, point-to-point ICP and generalised ICP (small_gicp).
 
 One pair runs on one thread. Lengths are in the clouds' unit; the tuned settings suit objects normalised to the unit sphere.
 """
@@ -13,6 +13,7 @@ from typing import Any
 import numpy as np
 import small_gicp
 from numpy.typing import ArrayLike
+from scipy.spatial.transform import Rotation
 
 from cmig_jax.baselines.method import Floats, Pose, as_matrix, as_pose, checked_cloud, no_motion, recorded
 
@@ -156,6 +157,37 @@ class Icp:
     def settings(self) -> dict[str, Any]:
         """The package, the start and the fields."""
         return recorded(self, _package(), start="identity", threads=1)
+
+
+@dataclass(frozen=True)
+class IcpFromMean:
+    """Point-to-point ICP that is told the mean of the rotations that a protocol draws, and starts there with the clouds' centres together.
+
+    The paper's angles are uniform in [0, 45] degrees about each axis, all to one side (Sec. IV-B). A network learns as much from its
+    training pairs; the identity, where `Icp` starts, is a corner of that range.
+
+    Attributes:
+        angle_deg: about each axis, R = Rx Ry Rz; `data.pairs.mean_angle_deg` says which. 0 brings the centres together only.
+        max_distances: cutoff of each round, as `icp` has it.
+        iterations, tolerance: of each round.
+    """
+
+    angle_deg: float
+    max_distances: tuple[float | None, ...] = TUNED_ROUNDS
+    iterations: int = 200
+    tolerance: float = 1e-6
+
+    def register(self, source: ArrayLike, target: ArrayLike) -> Pose:
+        """Register one pair."""
+        source, target = checked_cloud(source, "source"), checked_cloud(target, "target")
+        R = Rotation.from_euler("zyx", [self.angle_deg] * 3, degrees=True).as_matrix()
+        start = R, target.mean(axis=0) - R @ source.mean(axis=0)
+        return icp_rounds(source, target, self.max_distances, start, self.iterations, self.tolerance)
+
+    @property
+    def settings(self) -> dict[str, Any]:
+        """The package, the start and the fields."""
+        return recorded(self, _package(), start="mean rotation of the protocol, centres together", threads=1)
 
 
 def icp_rounds(

@@ -13,6 +13,7 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from cmig_jax.config import Categories, Config, DataConfig, ViewsConfig
+from cmig_jax.data.recordings import SOURCES as RECORDED
 from cmig_jax.data.render import render_views
 
 Pair = dict[str, Any]
@@ -151,6 +152,11 @@ def random_pose(
     x, y, z = rng.uniform(-max_angle_deg if turn == "either" else 0, max_angle_deg, 3)
     R = Rotation.from_euler("zyx", [z, y, x], degrees=True).as_matrix()
     return R, rng.uniform(-max_translation, max_translation, 3)
+
+
+def mean_angle_deg(data: DataConfig) -> float:
+    """Return the mean of each of the three angles that `random_pose` draws; 0 for recorded pairs, which turn to either side."""
+    return 0.0 if data.turn == "either" or data.source in RECORDED else data.max_angle_deg / 2
 
 
 def crop(

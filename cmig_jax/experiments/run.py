@@ -13,6 +13,7 @@ import jax
 
 from cmig_jax import baselines
 from cmig_jax.config import Config, to_json
+from cmig_jax.data.pairs import mean_angle_deg
 from cmig_jax.evaluation import METADATA, RESULTS, Method, evaluate, one_by_one
 from cmig_jax.experiments.plan import Job
 from cmig_jax.registration import load
@@ -129,12 +130,13 @@ def _baselines(job: Job, limit: int | None) -> Mapping[str, Mapping[str, float]]
     folder, settings = _baseline_folder(job), _baseline_settings(job.test, limit)
     results = _finished(folder, settings)
     if results is None:
-        results = evaluate(pairs_to_test(job.test, limit), _classical(), folder, command=job.commands()[1], config=settings)
+        results = evaluate(pairs_to_test(job.test, limit), _classical(job.test), folder, command=job.commands()[1], config=settings)
     return _methods_of(results)
 
 
-def _classical() -> dict[str, Method]:
-    return {name: one_by_one(method.register) for name, method in baselines.classical().items()}
+def _classical(test: Config) -> dict[str, Method]:
+    methods = baselines.classical(mean_angle_deg(test.data))
+    return {name: one_by_one(method.register) for name, method in methods.items()}
 
 
 def _baseline_folder(job: Job) -> Path:
@@ -146,7 +148,7 @@ def _baseline_settings(test: Config, limit: int | None) -> dict[str, Any]:
     return {
         "data": json.loads(to_json(test))["data"],
         "limit": limit,
-        "baselines": {name: method.settings for name, method in baselines.classical().items()},
+        "baselines": {name: method.settings for name, method in baselines.classical(mean_angle_deg(test.data)).items()},
     }
 
 

@@ -25,6 +25,11 @@ class PairTerm:
     row: Array | None
     column: Array
 
+    @property
+    def has_one_column(self) -> bool:
+        """Whether all columns are one vector, that of all pairs of clouds too."""
+        return self.column.shape[:2] == (1, 1)
+
     def times(self, factor: Array) -> PairTerm:
         """Multiply the channels by `factor [C]`."""
         factor = factor[None, None, :]
@@ -72,7 +77,7 @@ class PairSum:
 
 def _total(term: PairTerm) -> Array:
     """Sum a term over pairs, `[C]`."""
-    if term.column.shape[0] == term.column.shape[1] == 1:
+    if term.has_one_column:
         total = jnp.sum(term.scale) * term.column[0, 0]
     else:
         total = jnp.sum(jnp.sum(term.scale, axis=1)[..., None] * term.column, axis=(0, 1))
@@ -84,17 +89,17 @@ def _product_of(one: PairTerm, other: PairTerm) -> Array:
     both = one.scale * other.scale
     rows = None if one.row is None or other.row is None else one.row * other.row
     total = _total(PairTerm(both, rows, one.column * other.column))
-    for row, column in ((one.row, other.column), (other.row, one.column)):
+    for row, term in ((one.row, other), (other.row, one)):
         if row is not None:
-            total = total + jnp.sum(row * _over_columns(both, column), axis=(0, 1))
+            total = total + jnp.sum(row * _over_columns(both, term), axis=(0, 1))
     return total
 
 
-def _over_columns(weight: Array, column: Array) -> Array:
-    """Sum `weight_ij column_j` over columns, `[B, N, C]`."""
-    if column.shape[0] == column.shape[1] == 1:
-        return jnp.sum(weight, axis=2)[..., None] * column
-    return jnp.einsum("bnm,bmc->bnc", weight, column, precision=HIGHEST)
+def _over_columns(weight: Array, term: PairTerm) -> Array:
+    """Sum `weight_ij column_j` over the columns of a term, `[B, N, C]`."""
+    if term.has_one_column:
+        return jnp.sum(weight, axis=2)[..., None] * term.column
+    return jnp.einsum("bnm,bmc->bnc", weight, term.column, precision=HIGHEST)
 
 
 @jax.custom_vjp
@@ -112,7 +117,7 @@ def _values_backward(pairs: PairSum, gradient: Array) -> tuple[PairSum]:
     of_rows = jnp.einsum("bntm,bnmc->bntc", weights, gradient, precision=HIGHEST)
     terms = []
     for i, t in enumerate(pairs.terms, 1):
-        if t.column.shape[0] == t.column.shape[1] == 1:
+        if t.has_one_column:
             of_column = jnp.sum(of_rows[:, :, i], axis=(0, 1), keepdims=True)
             of_scale = jnp.matmul(gradient, t.column[0, 0], precision=HIGHEST)
         else:

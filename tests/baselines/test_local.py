@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from cmig_jax.baselines import Gicp, Icp, Identity, finish_by_gicp, finish_by_icp, gicp, icp, icp_cutoff, icp_tuned, identity
+from cmig_jax.baselines import Gicp, Icp, IcpFromMean, Identity, finish_by_gicp, finish_by_icp, gicp, icp, icp_cutoff, icp_tuned, identity
 from cmig_jax.metrics import isotropic_errors
 
 gicp_from_afar = Gicp().register
@@ -54,6 +54,19 @@ def test_gicp_slides_planes_on_planes_where_icp_sticks_to_samples(surface):
     source, target = surface(800, 0), surface(800, 1) + np.array([0.02, 0.0, 0.0])
     of_gicp, of_icp = (np.linalg.norm(register(source, target)[1] - [0.02, 0, 0]) for register in (gicp_from_afar, icp_tuned))
     assert of_gicp < 0.5 * of_icp
+
+
+def test_icp_from_the_mean_of_a_protocol_finds_what_icp_from_the_identity_misses(surface):
+    R_true, t_true = Rotation.from_euler("zyx", [90, 80, 100], degrees=True).as_matrix(), np.array([0.4, -0.5, 0.3])
+    source = surface(400, 0)
+    target = source @ R_true.T + t_true
+    errors = []
+    for method in (Icp(), IcpFromMean(90.0)):
+        R, t = method.register(source, target)
+        errors.append(isotropic_errors(R[None], t[None], R_true[None], t_true[None])[0].item())
+    assert errors[1] < 1e-3 < 10 < errors[0]
+    json.dumps(IcpFromMean(22.5).settings)
+    assert IcpFromMean(22.5).settings["angle_deg"] == 22.5
 
 
 def test_a_finish_lets_go_of_a_start_that_is_some_degrees_off_on_sparse_clouds(surface):

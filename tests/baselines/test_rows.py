@@ -4,7 +4,7 @@ import sys
 
 from cmig_jax import baselines
 
-CORE = ["identity", "ICP (cutoff 0.02)", "ICP (tuned)", "GICP"]
+CORE = ["identity", "ICP (cutoff 0.02)", "ICP (tuned)", "ICP (mean pose)", "GICP"]
 EXTRA = ["FPFH + RANSAC", "FGR", "KISS-Matcher"]
 
 

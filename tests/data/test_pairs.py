@@ -18,6 +18,7 @@ from cmig_jax.data.pairs import (
     keep_farthest_along,
     keep_nearest,
     make_pair,
+    mean_angle_deg,
     observe,
     random_pose,
     samplings,
@@ -103,6 +104,15 @@ def test_clouds_may_turn_to_either_side():
     np.testing.assert_allclose(angles.mean(0), 0, atol=4)
     pairs = [draw(DataConfig(points=100, turn="either"), seed=seed) for seed in range(20)]
     assert any(Rotation.from_matrix(pair["R"]).as_euler("XYZ").min() < 0 for pair in pairs)
+
+
+@pytest.mark.parametrize("turn", ["positive", "either"])
+def test_the_mean_angle_is_the_mean_of_what_is_drawn(turn):
+    rng = np.random.default_rng(0)
+    rotations = Rotation.from_matrix([random_pose(rng, 30.0, 0.5, turn)[0] for _ in range(500)])
+    drawn = rotations.as_euler("XYZ", degrees=True)
+    np.testing.assert_allclose(drawn.mean(0), mean_angle_deg(DataConfig(max_angle_deg=30.0, turn=turn)), atol=2.5)
+    assert mean_angle_deg(DataConfig(source="stanford-scans")) == 0
 
 
 @pytest.mark.parametrize("seed", range(3))

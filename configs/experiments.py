@@ -230,6 +230,17 @@ EXPERIMENTS: dict[str, Experiment] = {
         ),
         baselines=True,
     ),
+    "turns": Experiment(
+        "rotations to either side, whose mean is none: the paper's turn to one side, which is half the pose to a method that knows it",
+        NOISE | UNSEEN | {"data.turn": "either"},
+        (
+            *_three_presets(),
+            Row("corrected, trained on one side", "corrected", {"data.turn": "positive"}, test={"data.turn": "either"}),
+            Row("released, then ICP", "released", then="ICP"),
+            Row("corrected, then ICP", "corrected", then="ICP"),
+        ),
+        baselines=True,
+    ),
     "images": Experiment(
         "do the images matter? real, those of another object, black, or a network without any",
         NOISE | UNSEEN,

@@ -221,6 +221,9 @@ def finish_by_icp(source: ArrayLike, target: ArrayLike, start: Pose) -> Pose:
     no limit, 0.1  3.12 / 84.5 %      5.07 / 62.5 %      5.92 / 44.5 %      8.72 / 23.0 %        8.80 / 19.0 %
     =============  =================  =================  =================  ===================  ===================
 
+    On the 164 validation pairs of the `corrected` network of `docs/results.md` (144 points, sampled independently) it brings MAE(R) from
+    5.08 to 4.30, the cutoff of 0.1 alone to 4.68.
+
     Arguments, result and errors are those of `icp`; the cutoffs suit clouds in the unit sphere.
     """
     return icp_rounds(source, target, (0.2, 0.1), start)

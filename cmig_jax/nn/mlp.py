@@ -28,7 +28,9 @@ class Dense(nn.Module):
         C = x.shape[-1]
         kernel = self.param("kernel", torch_kernel, (C, self.features))
         dtype = self.dtype or kernel.dtype
-        y = x.astype(dtype) @ kernel.astype(dtype)
+        # Over one axis: where the kernel's derivative sums over several, XLA copies the points, turned.
+        flat = x.astype(dtype).reshape(-1, C) @ kernel.astype(dtype)
+        y = flat.reshape(*x.shape[:-1], self.features)
         if not self.use_bias:
             return y
         bias = self.param("bias", _torch_bias(C), (self.features,))

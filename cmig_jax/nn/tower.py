@@ -167,7 +167,9 @@ def _linear_backward(layer: Layer, saved: Any, gradient: tuple[Array, Moments]) 
         chunk, y, of_y = at
         outer = (of_y + (channels(slope, y.ndim) * y + channels(offset, y.ndim))).astype(kernel.dtype)
         x, pull = jax.vjp(layer, shared, chunk)
-        of_kernel = jnp.einsum("bnmc,bnmd->cd", nn.relu(x).astype(kernel.dtype), outer)
+        # Over one axis: a sum over several would have XLA copy the operand, turned.
+        flat = nn.relu(x).astype(kernel.dtype).reshape(-1, kernel.shape[0])
+        of_kernel = jnp.einsum("pc,pd->cd", flat, outer.reshape(-1, kernel.shape[1]))
         of_x = jnp.where(x > 0, (outer @ kernel.T).astype(x.dtype), 0)
         of_shared, of_chunk = pull(of_x)
         return jax.tree.map(jnp.add, total, (of_shared, of_kernel)), of_chunk

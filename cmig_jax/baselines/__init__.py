@@ -1,6 +1,7 @@
 """Registration without learning, to compare the network with (Sec. IV-A), every method with the settings it runs with.
 
-`classical` lists the methods: `local` has those that need a start (ICP, generalised ICP), `fpfh` and `kiss` the global ones,
+`classical` lists the methods: `local` has those that need a start (ICP, generalised ICP; `finish`
+has them from the pose of a network), `fpfh` and `kiss` the global ones,
 which come with the extra `[baselines]`; `missing` says which are not there, and what brings them. Every method takes a source `[N, 3]`
 and a target `[M, 3]` and returns `target_from_source`: R `[3, 3]`, t `[3]`, float64.
 """
@@ -10,6 +11,7 @@ from __future__ import annotations
 from collections.abc import Callable
 from typing import Any
 
+from cmig_jax.baselines.finish import CUTOFFS, finish_by_gicp, finish_by_icp
 from cmig_jax.baselines.fpfh import FastGlobal, FpfhRansac, load_open3d
 from cmig_jax.baselines.kiss import KissMatcher, load_kiss_matcher
 from cmig_jax.baselines.local import (
@@ -17,10 +19,7 @@ from cmig_jax.baselines.local import (
     ICP_TUNED,
     Gicp,
     Icp,
-    IcpFromMean,
     Identity,
-    finish_by_gicp,
-    finish_by_icp,
     gicp,
     icp,
     icp_cutoff,
@@ -28,14 +27,16 @@ from cmig_jax.baselines.local import (
     identity,
 )
 from cmig_jax.baselines.method import Baseline, Pose
+from cmig_jax.config import DataConfig
+from cmig_jax.data.pairs import mean_angle_deg
 
 __all__ = [
+    "CUTOFFS",
     "Baseline",
     "FastGlobal",
     "FpfhRansac",
     "Gicp",
     "Icp",
-    "IcpFromMean",
     "Identity",
     "KissMatcher",
     "Pose",
@@ -53,17 +54,17 @@ __all__ = [
 INSTALL = "pip install -e '.[baselines]'"
 
 
-def classical(mean_angle_deg: float = 0.0) -> dict[str, Baseline]:
+def classical(data: DataConfig) -> dict[str, Baseline]:
     """Return the methods without learning by the name of their row: the core's, and those of the extra that can be imported.
 
     Args:
-        mean_angle_deg: what the row "ICP (mean pose)" is told of the protocol, `data.pairs.mean_angle_deg`.
+        data: the protocol, whose mean rotation the row "ICP (mean pose)" is told.
     """
     rows: dict[str, Baseline] = {
         "identity": Identity(),
         "ICP (cutoff 0.02)": ICP_CUTOFF,
         "ICP (tuned)": ICP_TUNED,
-        "ICP (mean pose)": IcpFromMean(mean_angle_deg),
+        "ICP (mean pose)": Icp(start_angle_deg=mean_angle_deg(data)),
         "GICP": Gicp(),
     }
     absent = missing()

@@ -138,56 +138,36 @@ class Identity:
 
 @dataclass(frozen=True)
 class Icp:
-    """Point-to-point ICP from the identity, in rounds that each start where the last one ended.
+    """Point-to-point ICP, in rounds that each start where the last one ended.
 
     Attributes:
         max_distances: cutoff of each round, as `icp` has it.
         iterations, tolerance: of each round.
+        start_angle_deg: None starts from the identity. A number starts with the clouds' centres together and this angle about each axis,
+            R = Rx Ry Rz, such as the mean of what a protocol draws (`data.pairs.mean_angle_deg`): the paper's angles are uniform in
+            [0, 45] degrees, all to one side (Sec. IV-B), so that the identity is a corner of their range. A network learns as much from
+            its training pairs.
     """
 
     max_distances: tuple[float | None, ...] = TUNED_ROUNDS
     iterations: int = 200
     tolerance: float = 1e-6
-
-    def register(self, source: ArrayLike, target: ArrayLike) -> Pose:
-        """Register one pair."""
-        return icp_rounds(source, target, self.max_distances, no_motion(), self.iterations, self.tolerance)
-
-    @property
-    def settings(self) -> dict[str, Any]:
-        """The package, the start and the fields."""
-        return recorded(self, _package(), start="identity", threads=1)
-
-
-@dataclass(frozen=True)
-class IcpFromMean:
-    """Point-to-point ICP that is told the mean of the rotations that a protocol draws, and starts there with the clouds' centres together.
-
-    The paper's angles are uniform in [0, 45] degrees about each axis, all to one side (Sec. IV-B). A network learns as much from its
-    training pairs; the identity, where `Icp` starts, is a corner of that range.
-
-    Attributes:
-        angle_deg: about each axis, R = Rx Ry Rz; `data.pairs.mean_angle_deg` says which. 0 brings the centres together only.
-        max_distances: cutoff of each round, as `icp` has it.
-        iterations, tolerance: of each round.
-    """
-
-    angle_deg: float
-    max_distances: tuple[float | None, ...] = TUNED_ROUNDS
-    iterations: int = 200
-    tolerance: float = 1e-6
+    start_angle_deg: float | None = None
 
     def register(self, source: ArrayLike, target: ArrayLike) -> Pose:
         """Register one pair."""
         source, target = checked_cloud(source, "source"), checked_cloud(target, "target")
-        R = Rotation.from_euler("zyx", [self.angle_deg] * 3, degrees=True).as_matrix()
-        start = R, target.mean(axis=0) - R @ source.mean(axis=0)
+        start = no_motion()
+        if self.start_angle_deg is not None:
+            R = Rotation.from_euler("zyx", [self.start_angle_deg] * 3, degrees=True).as_matrix()
+            start = R, target.mean(axis=0) - R @ source.mean(axis=0)
         return icp_rounds(source, target, self.max_distances, start, self.iterations, self.tolerance)
 
     @property
     def settings(self) -> dict[str, Any]:
         """The package, the start and the fields."""
-        return recorded(self, _package(), start="mean rotation of the protocol, centres together", threads=1)
+        start = "identity" if self.start_angle_deg is None else "this angle about each axis, centres together"
+        return recorded(self, _package(), start=start, threads=1)
 
 
 def icp_rounds(
@@ -202,40 +182,6 @@ def icp_rounds(
     for max_distance in max_distances:
         start = icp(source, target, max_distance=max_distance, iterations=iterations, tolerance=tolerance, start=start)
     return start
-
-
-def finish_by_icp(source: ArrayLike, target: ArrayLike, start: Pose) -> Pose:
-    """Sharpen a pose by ICP, with a cutoff of 0.2, then of 0.1.
-
-    A start that is some degrees off leaves many partners of a sparse cloud farther away than 0.1, and what is within it holds the pose
-    where it is. Chosen on the pose of the network that comes with the package, 200 real objects; MAE(R) / recall by points before the
-    crop, sampling and crop:
-
-    =============  =================  =================  =================  ===================  ===================
-    cutoffs        512, once, shared  512 twice, shared  256 twice, shared  256 twice, one each  192 twice, one each
-    =============  =================  =================  =================  ===================  ===================
-    none (start)   4.76 / 66.0 %      6.81 / 36.0 %      7.94 / 24.0 %      9.80 / 17.5 %        10.0 / 11.5 %
-    0.1            2.99 / 85.0 %      5.29 / 60.0 %      6.91 / 39.5 %      9.07 / 24.5 %        9.16 / 18.0 %
-    **0.2, 0.1**   2.95 / 86.5 %      4.99 / 64.5 %      6.03 / 44.5 %      8.35 / 26.0 %        8.46 / 19.5 %
-    0.3, 0.1       2.92 / 86.0 %      5.11 / 62.5 %      5.78 / 44.5 %      8.04 / 24.0 %        8.48 / 19.5 %
-    no limit, 0.1  3.12 / 84.5 %      5.07 / 62.5 %      5.92 / 44.5 %      8.72 / 23.0 %        8.80 / 19.0 %
-    =============  =================  =================  =================  ===================  ===================
-
-    On the 164 validation pairs of the `corrected` network of `docs/results.md` (144 points, sampled independently) it brings MAE(R) from
-    5.08 to 4.30, the cutoff of 0.1 alone to 4.68.
-
-    Arguments, result and errors are those of `icp`; the cutoffs suit clouds in the unit sphere.
-    """
-    return icp_rounds(source, target, (0.2, 0.1), start)
-
-
-def finish_by_gicp(source: ArrayLike, target: ArrayLike, start: Pose) -> Pose:
-    """Sharpen a pose by generalised ICP with a cutoff of 0.1, for clouds in the unit sphere.
-
-    A wider first round is no better here: on 100 of the real objects above (512 points, twice, a crop each) recall is 54 % with 0.1 and
-    with 0.2 before it. Arguments, result and errors are those of `gicp`.
-    """
-    return gicp(source, target, max_distance=0.1, start=start)
 
 
 ICP_CUTOFF = Icp(max_distances=(0.02,), iterations=30)

@@ -13,7 +13,6 @@ import jax
 
 from cmig_jax import baselines
 from cmig_jax.config import Config, to_json
-from cmig_jax.data.pairs import mean_angle_deg
 from cmig_jax.evaluation import METADATA, RESULTS, Method, evaluate, one_by_one
 from cmig_jax.experiments.plan import Job
 from cmig_jax.registration import load
@@ -123,7 +122,8 @@ def _evaluate(job: Job, limit: int | None) -> dict[str, Any]:
 
 def _settings(job: Job, limit: int | None) -> dict[str, Any]:
     """What the results depend on, beside the checkpoint: a run is trained to its end before it is evaluated."""
-    return json.loads(to_json(job.test)) | {"limit": limit, "trained": json.loads(to_json(job.training))}
+    settings = json.loads(to_json(job.test)) | {"limit": limit, "trained": json.loads(to_json(job.training))}
+    return settings | ({"finish": baselines.CUTOFFS[job.row.then]} if job.row.then else {})
 
 
 def _baselines(job: Job, limit: int | None) -> Mapping[str, Mapping[str, float]]:
@@ -135,8 +135,7 @@ def _baselines(job: Job, limit: int | None) -> Mapping[str, Mapping[str, float]]
 
 
 def _classical(test: Config) -> dict[str, Method]:
-    methods = baselines.classical(mean_angle_deg(test.data))
-    return {name: one_by_one(method.register) for name, method in methods.items()}
+    return {name: one_by_one(method.register) for name, method in baselines.classical(test.data).items()}
 
 
 def _baseline_folder(job: Job) -> Path:
@@ -148,7 +147,7 @@ def _baseline_settings(test: Config, limit: int | None) -> dict[str, Any]:
     return {
         "data": json.loads(to_json(test))["data"],
         "limit": limit,
-        "baselines": {name: method.settings for name, method in baselines.classical(mean_angle_deg(test.data)).items()},
+        "baselines": {name: method.settings for name, method in baselines.classical(test.data).items()},
     }
 
 

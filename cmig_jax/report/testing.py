@@ -11,7 +11,7 @@ import numpy as np
 
 from cmig_jax import baselines
 from cmig_jax.config import Config, is_inside, to_json
-from cmig_jax.data.pairs import Pair, Pairs, evenly_spaced, in_categories, mean_angle_deg
+from cmig_jax.data.pairs import Pair, Pairs, evenly_spaced, in_categories
 from cmig_jax.data.prepare import ensure_prepared
 from cmig_jax.data.recorded_pairs import RecordedPairs
 from cmig_jax.data.recordings import SOURCES as RECORDED
@@ -78,7 +78,8 @@ def evaluate_run(
     measured = Measured(pairs, config.loss.match_threshold)
     folder = run / out
     settings = json.loads(to_json(config)) | {"checkpoint": {"which": which, "step": network.step}}
-    settings["baselines"] = {name: method.settings for name, method in baselines.classical(mean_angle_deg(config.data)).items()}
+    settings["baselines"] = {name: method.settings for name, method in baselines.classical(config.data).items()}
+    settings["finish"] = baselines.CUTOFFS
     results = evaluate(measured, methods_for(network), folder, command=command, config=settings, chunk=batch)
     write_atomically(folder / "table.md", markdown_table(results))
     write_atomically(folder / "table.tex", latex_table(results))
@@ -99,7 +100,7 @@ def evaluate_run(
 
 def methods_for(network: Network) -> dict[str, Method]:
     """Return what is compared, by name: methods without learning, the network, and the network finished by ICP and by generalised ICP."""
-    methods = baselines.classical(mean_angle_deg(network.config.data))
+    methods = baselines.classical(network.config.data)
     return {name: one_by_one(method.register) for name, method in methods.items()} | {
         NETWORK: lambda pairs: network([dict(pair) for pair in pairs]),
         f"{NETWORK} + ICP": lambda pairs: refined(network, [dict(pair) for pair in pairs], baselines.finish_by_icp),

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from cmig_jax.baselines import Gicp, Icp, IcpFromMean, Identity, finish_by_gicp, finish_by_icp, gicp, icp, icp_cutoff, icp_tuned, identity
+from cmig_jax.baselines import Gicp, Icp, Identity, gicp, icp, icp_cutoff, icp_tuned, identity
 from cmig_jax.metrics import isotropic_errors
 
 gicp_from_afar = Gicp().register
@@ -61,30 +61,13 @@ def test_icp_from_the_mean_of_a_protocol_finds_what_icp_from_the_identity_misses
     source = surface(400, 0)
     target = source @ R_true.T + t_true
     errors = []
-    for method in (Icp(), IcpFromMean(90.0)):
+    for method in (Icp(), Icp(start_angle_deg=90.0)):
         R, t = method.register(source, target)
         errors.append(isotropic_errors(R[None], t[None], R_true[None], t_true[None])[0].item())
     assert errors[1] < 1e-3 < 10 < errors[0]
-    json.dumps(IcpFromMean(22.5).settings)
-    assert IcpFromMean(22.5).settings["angle_deg"] == 22.5
-
-
-def test_a_finish_lets_go_of_a_start_that_is_some_degrees_off_on_sparse_clouds(surface):
-    """Independent samplings, a few points apart: where partners must be within 0.1, too many of a turned cloud have none."""
-    start = Rotation.from_rotvec(np.radians([11.0, 0.0, 11.0])).as_matrix(), np.array([0.05, 0.0, 0.0])
-
-    def angle(finish):
-        poses = [finish(surface(100, 2 * i), surface(100, 2 * i + 1))[0] for i in range(10)]
-        return isotropic_errors(np.stack(poses), np.zeros((10, 3)), np.tile(np.eye(3), (10, 1, 1)), np.zeros((10, 3)))[0].mean()
-
-    assert angle(lambda x, y: finish_by_icp(x, y, start)) < 0.9 * angle(lambda x, y: icp(x, y, max_distance=0.1, start=start))
-
-
-def test_a_finish_by_gicp_is_gicp_within_reach(pair):
-    source, target, *_ = pair(5, 0.02)
-    start = np.eye(3), np.zeros(3)
-    for found, one in zip(finish_by_gicp(source, target, start), gicp(source, target, max_distance=0.1, start=start), strict=True):
-        np.testing.assert_array_equal(found, one)
+    settings = json.loads(json.dumps(Icp(start_angle_deg=22.5).settings))
+    assert settings["start_angle_deg"] == 22.5
+    assert settings["start"] != Icp().settings["start"] == "identity"
 
 
 def test_identity(surface):

@@ -3,13 +3,14 @@
 import sys
 
 from cmig_jax import baselines
+from cmig_jax.config import DataConfig
 
 CORE = ["identity", "ICP (cutoff 0.02)", "ICP (tuned)", "ICP (mean pose)", "GICP"]
 EXTRA = ["FPFH + RANSAC", "FGR", "KISS-Matcher"]
 
 
 def test_every_row_is_there_or_explained(surface):
-    rows, absent = baselines.classical(), baselines.missing()
+    rows, absent = baselines.classical(DataConfig()), baselines.missing()
     assert list(rows) == [name for name in CORE + EXTRA if name not in absent]
     assert set(rows) | set(absent) == set(CORE + EXTRA)
     cloud = surface(40, 0)
@@ -22,7 +23,7 @@ def test_every_row_is_there_or_explained(surface):
 def test_rows_without_their_package_are_left_out_with_the_command_that_brings_them(monkeypatch):
     for package in ("open3d", "kiss_matcher"):
         monkeypatch.setitem(sys.modules, package, None)  # as if it were not installed
-    assert list(baselines.classical()) == CORE
+    assert list(baselines.classical(DataConfig())) == CORE
     absent = baselines.missing()
     assert list(absent) == EXTRA
     for package, reason in zip(("open3d", "open3d", "kiss_matcher"), absent.values(), strict=True):
@@ -35,12 +36,12 @@ def test_a_package_that_does_not_load_is_explained(monkeypatch):
         raise ImportError("libusb-1.0.so.0: cannot open shared object file")
 
     monkeypatch.setattr(baselines, "load_open3d", load)
-    assert "FGR" not in baselines.classical()
+    assert "FGR" not in baselines.classical(DataConfig())
     assert "libusb-1.0-0" in baselines.missing()["FGR"]
 
 
 def test_the_functions_are_the_rows(surface):
     source, target = surface(60, 0), surface(50, 1)
     for name, function in {"identity": baselines.identity, "ICP (tuned)": baselines.icp_tuned}.items():
-        for one, other in zip(baselines.classical()[name].register(source, target), function(source, target), strict=True):
+        for one, other in zip(baselines.classical(DataConfig())[name].register(source, target), function(source, target), strict=True):
             assert (one == other).all()

@@ -9,7 +9,8 @@ it rounds like the plain sum. Accelerators, whose libraries have all this, and h
 from __future__ import annotations
 
 import functools
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterable, Sequence
+from typing import Any
 
 import flax.linen as nn
 import jax
@@ -17,15 +18,16 @@ import jax.numpy as jnp
 from jax import Array
 from jax.sharding import PartitionSpec
 
-HIGHEST = jax.lax.Precision.HIGHEST
 NUMBERS_AT_A_TIME = 2**21  # of what a loop over images makes of them: what a CPU's cache holds
 he_fan_out = nn.initializers.variance_scaling(2.0, "fan_out", "normal")
 
 # Winograd's matrices: of two results in a row from four pixels d and three weights g, A^T ((G g) * (B^T d)).
 B_T = ((1, 0, -1, 0), (0, 1, 1, 0), (0, -1, 1, 0), (0, 1, 0, -1))
-G = ((1.0, 0.0, 0.0), (0.5, 0.5, 0.5), (0.5, -0.5, 0.5), (0.0, 0.0, 1.0))
+G = ((1, 0, 0), (0.5, 0.5, 0.5), (0.5, -0.5, 0.5), (0, 0, 1))
+G_T = tuple(zip(*G, strict=True))
 A_T = ((1, 1, 1, 0), (0, 1, -1, -1))
 A = tuple(zip(*A_T, strict=True))
+TURNED = (3, 1, 2, 0)  # the rows of G times a kernel that is read backwards
 
 
 class Convolution(nn.Module):
@@ -68,7 +70,7 @@ def _is_winograd(kernel: Array, stride: int) -> bool:
 
 @functools.partial(jax.custom_vjp, nondiff_argnames=("stride",))
 def _convolve(x: Array, kernel: Array, stride: int) -> Array:
-    return _winograd(x, kernel) if _is_winograd(kernel, stride) else _plain(x, kernel, stride)
+    return _winograd(x, _apply(G, kernel)) if _is_winograd(kernel, stride) else _plain(x, kernel, stride)
 
 
 def _convolve_forward(x: Array, kernel: Array, stride: int) -> tuple[Array, tuple[Array, Array]]:
@@ -78,7 +80,9 @@ def _convolve_forward(x: Array, kernel: Array, stride: int) -> tuple[Array, tupl
 def _convolve_backward(stride: int, saved: tuple[Array, Array], gradient: Array) -> tuple[Array, Array]:
     x, kernel = saved
     if _is_winograd(kernel, stride):
-        return _winograd(gradient, kernel[::-1, ::-1].swapaxes(2, 3)), _winograd_of_kernel(x, gradient)
+        weights = _apply(G, jax.lax.optimization_barrier(kernel))  # again: they are larger than the kernel
+        turned = [weights[4 * i + j].T for i in TURNED for j in TURNED]
+        return _winograd(gradient, turned), _winograd_of_kernel(x, gradient)
     (of_x,) = jax.linear_transpose(lambda image: _plain(image, kernel, stride), x)(gradient)
     return of_x, _of_kernel(x, gradient, kernel.shape[0], stride)
 
@@ -104,66 +108,64 @@ def _of_kernel(x: Array, gradient: Array, size: int, stride: int) -> Array:
     return _sum_over_images(visit, numbers, x, gradient).reshape(size, size, x.shape[-1], features)
 
 
-def _winograd(x: Array, kernel: Array) -> Array:
-    weights = _square(G, kernel)  # [16, C, C']
+def _winograd(x: Array, weights: Sequence[Array]) -> Array:
+    """Convolve with a kernel that `G` has transformed to 16 weights `[C, C']`.
+
+    16 products of arrays, and not one of stacked ones, which XLA would write once more.
+    """
 
     def visit(x: Array) -> Array:
-        _, height, width, _ = x.shape
-        return _joined(jnp.einsum("tpc,tcd->tpd", _tiles(x), weights), height, width)
+        return _joined([tile @ weight for tile, weight in zip(_tiles(x), weights, strict=True)], x)
 
-    chunk = _images_at_a_time(x, 4 * x.shape[1] * x.shape[2] * max(kernel.shape[2:]))
+    chunk = _images_at_a_time(x, 4 * x.shape[1] * x.shape[2] * max(weights[0].shape))
     if chunk == len(x):
         return visit(x)
-    return jax.lax.map(visit, _split(x, chunk)).reshape(*x.shape[:-1], kernel.shape[-1])
+    return jax.lax.map(visit, _split(x, chunk)).reshape(*x.shape[:-1], weights[0].shape[-1])
 
 
 def _winograd_of_kernel(x: Array, gradient: Array) -> Array:
     """Differentiate in the kernel: the transposes of Winograd's transforms around one product for each of the 16 places."""
+    features = gradient.shape[-1]
 
     def visit(x: Array, gradient: Array) -> Array:
         padded = jnp.pad(gradient, ((0, 0), (0, gradient.shape[1] % 2), (0, gradient.shape[2] % 2), (0, 0)))
         parts = _apply(A, [[padded[:, i::2, j::2] for j in range(2)] for i in range(2)])
-        return jnp.einsum("tpc,tpd->tcd", _tiles(x), jnp.stack(parts).reshape(16, -1, gradient.shape[-1]))
+        pairs = zip(_tiles(x), parts, strict=True)
+        return jnp.stack([jnp.einsum("pc,pd->cd", tile, part.reshape(-1, features)) for tile, part in pairs])
 
-    numbers = 4 * x.shape[1] * x.shape[2] * max(x.shape[-1], gradient.shape[-1])
-    total = _sum_over_images(visit, numbers, x, gradient).reshape(4, 4, x.shape[-1], -1)
-    g = jnp.asarray(G, total.dtype)
-    return jnp.einsum("ui,vj,uvcd->ijcd", g, g, total, precision=HIGHEST)
+    numbers = 4 * x.shape[1] * x.shape[2] * max(x.shape[-1], features)
+    total = _sum_over_images(visit, numbers, x, gradient).reshape(4, 4, -1, features)
+    return jnp.stack(_apply(G_T, total)).reshape(3, 3, -1, features)
 
 
-def _tiles(x: Array) -> Array:
-    """Transform every tile of 4 x 4 pixels, two pixels apart, of the padded images: `[16, tiles, C]`."""
+def _tiles(x: Array) -> list[Array]:
+    """Transform every tile of 4 x 4 pixels, two pixels apart, of the padded images: 16 of `[tiles, C]`."""
     _, height, width, C = x.shape
     padded = jnp.pad(x, ((0, 0), (1, 1 + height % 2), (1, 1 + width % 2), (0, 0)))
     rows, columns = height + height % 2, width + width % 2
     pixels = [[padded[:, i : i + rows : 2, j : j + columns : 2] for j in range(4)] for i in range(4)]
-    return jnp.stack(_apply(B_T, pixels)).reshape(16, -1, C)
+    return [part.reshape(-1, C) for part in _apply(B_T, pixels)]
 
 
-def _joined(products: Array, height: int, width: int) -> Array:
-    """Transform `[16, tiles, C]` to two by two results each, and lay these side by side: `[B, H, W, C]`."""
-    down, right, C = -(-height // 2), -(-width // 2), products.shape[-1]
-    places = products.reshape(4, 4, -1, down, right, C)
-    results = _apply(A_T, [[places[i, j] for j in range(4)] for i in range(4)])
+def _joined(products: Sequence[Array], images: Array) -> Array:
+    """Transform 16 of `[tiles, C]` to two by two results each, and lay these side by side, as the `images` that tiles were made of."""
+    _, height, width, _ = images.shape
+    down, right, C = -(-height // 2), -(-width // 2), products[0].shape[-1]
+    places = [x.reshape(-1, down, right, C) for x in products]
+    results = _apply(A_T, [places[4 * i : 4 * i + 4] for i in range(4)])
     rows = [jnp.stack(results[2 * i : 2 * i + 2], axis=3) for i in range(2)]
     return jnp.stack(rows, axis=2).reshape(-1, 2 * down, 2 * right, C)[:, :height, :width]
 
 
-def _apply(matrix: Sequence[Sequence[int]], parts: Sequence[Sequence[Array]]) -> list[Array]:
-    """Multiply a square of arrays by a matrix of 0 and +-1 from the left and by its transpose from the right, row by row."""
+def _apply(matrix: Sequence[Sequence[float]], parts: Any) -> list[Array]:
+    """Multiply a square of arrays (of lists, or the first two axes of one) by a matrix from the left and its transpose from the right."""
 
-    def combine(row: Sequence[int], arrays: Sequence[Array]) -> Array:
-        terms = [x if sign > 0 else -x for sign, x in zip(row, arrays, strict=True) if sign]
+    def combine(row: Sequence[float], arrays: Iterable[Array]) -> Array:
+        terms = [x if factor == 1 else -x if factor == -1 else factor * x for factor, x in zip(row, arrays, strict=True) if factor]
         return functools.reduce(jnp.add, terms)
 
     left = [[combine(row, column) for column in zip(*parts, strict=True)] for row in matrix]
     return [combine(row, line) for line in left for row in matrix]
-
-
-def _square(matrix: Sequence[Sequence[float]], kernel: Array) -> Array:
-    """Multiply a kernel `[3, 3, C, C']` by a `[4, 3]` matrix along both axes: `[16, C, C']`."""
-    m = jnp.asarray(matrix, kernel.dtype)
-    return jnp.einsum("ui,vj,ijcd->uvcd", m, m, kernel, precision=HIGHEST).reshape(-1, *kernel.shape[2:])
 
 
 def _sum_over_images(visit: Callable[..., Array], numbers: int, *arrays: Array) -> Array:

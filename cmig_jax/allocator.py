@@ -2,7 +2,7 @@
 
 A compiled step takes its working memory in one block and gives it back at its end. By default the C library returns such a block to
 the system, and the system clears every page of it again at the next step: a quarter of a small network's step on a CPU. The price of
-keeping it is one heap for all threads, and a compilation leaves some hundred thousand holes there, of as many sizes: whoever asks for a
+keeping it is one heap for all threads, and a compilation leaves a hundred thousand holes there, of all sizes: whoever asks for a
 piece later has the C library walk through those that are too small. A step took up to twice as long, until the program ended.
 """
 

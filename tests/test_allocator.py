@@ -19,10 +19,7 @@ faults()
 {between}
 print(faults())
 """
-
-
 HOLES = """
-import ctypes
 import random
 from cmig_jax.allocator import _glibc, keep_freed_memory, return_freed_memory
 keep_freed_memory()

@@ -1,9 +1,8 @@
 """Registration without learning, to compare the network with (Sec. IV-A), every method with the settings it runs with.
 
-`classical` lists the methods: `local` has those that need a start (ICP, generalised ICP; `finish`
-has them from the pose of a network), `fpfh` and `kiss` the global ones,
-which come with the extra `[baselines]`; `missing` says which are not there, and what brings them. Every method takes a source `[N, 3]`
-and a target `[M, 3]` and returns `target_from_source`: R `[3, 3]`, t `[3]`, float64.
+`classical` lists the methods: `local` has those that need a start (ICP, generalised ICP; `finish` has them from the pose of a network),
+`fpfh` and `kiss` the global ones, which come with the extra `[baselines]`; `missing` says which are not there, and what brings them.
+Every method takes a source `[N, 3]` and a target `[M, 3]` and returns `target_from_source`: R `[3, 3]`, t `[3]`, float64.
 """
 
 from __future__ import annotations

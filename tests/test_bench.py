@@ -8,6 +8,8 @@ import subprocess
 import sys
 from pathlib import Path
 
+import jax
+import jax.numpy as jnp
 import numpy as np
 import pytest
 
@@ -16,6 +18,7 @@ from cmig_jax.bench.cases import CASES, make_arrays
 from cmig_jax.bench.clock import KEPT, OURS, PYTORCH, Timing, in_turns
 from cmig_jax.bench.clouds import measure_clouds
 from cmig_jax.bench.memory import resident
+from cmig_jax.bench.products import Products, product_rate, products_of
 from cmig_jax.bench.worker import Worker
 from cmig_jax.config import ComputeConfig
 
@@ -84,6 +87,45 @@ def test_work_is_done_in_turns():
     assert calls == [PYTORCH, KEPT, OURS] * 3
     assert timing == Timing({PYTORCH: 5.0, KEPT: 3.0, OURS: 1.0}, spread=2.0)
     assert timing.as_json() == {"ratio": 5, "ratio_kept": 3, "pytorch_s": 5, "pytorch_kept_s": 3, "ours_s": 1, "spread": 2}
+
+
+def product(x):
+    return x @ x.T
+
+
+def convolution(x):
+    image, kernel = x.reshape(1, 4, 4, 2), jnp.ones((3, 3, 2, 5))
+    return jax.lax.conv_general_dilated(image, kernel, (2, 2), "SAME", dimension_numbers=("NHWC", "HWIO", "NHWC"))
+
+
+@pytest.mark.parametrize(
+    ("function", "expected"),
+    [
+        (product, Products(2 * 8 * 8 * 4, 4 * (32 + 32 + 64))),
+        (jax.jit(product), Products(2 * 8 * 8 * 4, 4 * (32 + 32 + 64))),
+        (lambda x: jax.lax.map(product, jnp.stack([x, x, x])), Products(2 * 8 * 8 * 4, 4 * (32 + 32 + 64)) * 3),
+        (lambda x: jax.lax.cond(x[0, 0] > 0, product, lambda x: jnp.ones((8, 8)), x), Products(2 * 8 * 8 * 4, 4 * (32 + 32 + 64))),
+        (convolution, Products(2 * (2 * 2 * 5) * (3 * 3 * 2), 4 * (32 + 90 + 20))),
+        (lambda x: jax.linear_transpose(convolution, x)(jnp.ones((1, 2, 2, 5))), Products(2 * 32 * (3 * 3 * 5) // 4, 4 * (20 + 90 + 32))),
+        (lambda x: x + 1, Products()),
+    ],
+)
+def test_products_are_counted_as_often_as_they_run(function, expected):
+    assert products_of(jax.make_jaxpr(function)(jnp.ones((8, 4)))) == expected
+
+
+def test_the_products_of_a_step_are_counted_through_loops_and_derivatives():
+    from cmig_jax.bench.networks import make_ours
+
+    network = make_ours("tiny", "cpu")
+    network.inference()
+    network.training()
+    inference, training = (network.costs[mode]["operations"] for mode in ("inference", "training"))
+    assert 2 * inference < training < 4 * inference
+
+
+def test_a_large_product_takes_time():
+    assert 1e8 < product_rate(jnp.float32) < 1e16
 
 
 def test_inputs_are_a_function_of_the_seed():

@@ -78,16 +78,19 @@ def case_lines(name: str, result: dict[str, Any]) -> list[str]:
     case = CASES[name]
     images = f"{case.views} views of {case.image_size} x {case.image_size}" if case.images else "image features given"
     lines = [f"{name}: {case.pairs} pairs of {case.points} points, {images}, K = {case.sizes.keypoints}, n = {case.sizes.iterations}"]
-    lines.append(f"  {'':26} {'PyTorch s':>10} {'kept s':>8} {'ours s':>8} {'ratio':>6} {'kept':>6} {'Gop':>7} {'GB moved':>9}")
+    lines.append(f"  {'':26} {'PyTorch s':>10} {'kept s':>8} {'ours s':>8} {'ratio':>6} {'kept':>6} {'Gop':>7} {'GB':>6} {'floor s':>8}")
     for mode in ("inference", "training"):
         for what, row in result[mode].items():
             kept = row.get("pytorch_kept_s", row["pytorch_s"])
             numbers = f"{row['pytorch_s']:10.3f} {kept:8.3f} {row['ours_s']:8.3f} {row['ratio']:6.2f} {kept / row['ours_s']:6.2f}"
-            lines.append(f"  {mode + ' ' + what:26} {numbers} {row['operations'] / 1e9:7.1f} {row['bytes'] / 1e9:9.2f}")
+            products = f"{row['operations'] / 1e9:7.1f} {row['bytes'] / 1e9:6.2f} {row['floor_s']:8.3f}"
+            lines.append(f"  {mode + ' ' + what:26} {numbers} {products}")
     for what, key in (("training", "memory"), ("inference", "memory_inference")):
         if key in result:
             row = result[key]
             lines.append(f"  peak memory, {what:13} {row['pytorch_gb']:7.2f} GB {row['ours_gb']:7.2f} GB {row['ratio']:7.2f}")
+    rate = result["product_rate"] / 1e9
+    lines.append(f"  Gop, GB: of our products, read and written once; floor: those at {rate:.0f} Gop/s, the rate of one large product here")
     compiled = ", ".join(f"{mode} {seconds:.1f} s" for mode, seconds in result["compile_s"].items())
     return [*lines, f"  compilation (ours, or its reading from the cache): {compiled}"]
 

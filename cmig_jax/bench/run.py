@@ -27,8 +27,8 @@ def run(name: str, repetitions: int, device: str, compute: ComputeConfig, memory
         stages: also time each stage alone.
 
     Returns:
-        `inference` and `training`, each with `whole` and the stages (`Timing.as_json`, and ours' costs), `memory` of a training step,
-        `memory_inference`, and `compile_s`.
+        `inference` and `training`, each with `whole` and the stages (`Timing.as_json`, ours' costs, and `floor_s`, what the products alone
+        would take at `product_rate`), `memory` of a training step, `memory_inference`, and `compile_s`.
     """
     results = _times(name, repetitions, device, compute, stages)
     if memory:
@@ -50,7 +50,9 @@ def _times(name: str, repetitions: int, device: str, compute: ComputeConfig, sta
     for mode in ("inference", "training"):
         for what, row in results[mode].items():
             row |= ours["costs"][mode if what == "whole" else f"{mode}.{what}"]
-    return results | {"compile_s": {mode: ours["compile_seconds"][mode] for mode in ("inference", "training")}}
+            row["floor_s"] = row["operations"] / ours["product_rate"]
+    compile_s = {mode: ours["compile_seconds"][mode] for mode in ("inference", "training")}
+    return results | {"compile_s": compile_s, "product_rate": ours["product_rate"]}
 
 
 def _memory(name: str, what: str, device: str, compute: ComputeConfig) -> dict[str, float]:

@@ -43,7 +43,7 @@ class Worker:
         return self._ask(work)
 
     def costs(self) -> dict[str, Any]:
-        """Return `compile_seconds` and `costs` of ours."""
+        """Return `compile_seconds` and `costs` of ours, and the `product_rate`, operations per second."""
         return self._ask(COSTS)
 
     def _ask(self, line: str) -> Any:
@@ -86,7 +86,8 @@ def main(network: Any) -> None:
     for line in sys.stdin:
         name = line.strip()
         if name == COSTS:
-            print(json.dumps({"compile_seconds": network.compile_seconds, "costs": network.costs}), flush=True)
+            known = {"compile_seconds": network.compile_seconds, "costs": network.costs, "product_rate": network.product_rate()}
+            print(json.dumps(known), flush=True)
             continue
         if name not in works:
             mode, what = name.split()

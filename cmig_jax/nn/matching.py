@@ -6,6 +6,9 @@ and one from coordinates and adds them; the idam head takes one from both togeth
 
 from __future__ import annotations
 
+import functools
+from collections.abc import Callable
+
 import flax.linen as nn
 import jax
 import jax.numpy as jnp
@@ -155,22 +158,40 @@ class Credibility(nn.Module):
 
 
 def _best_of_targets(parameters: tuple[Array, Array | None], feature: Array, coordinate: Array, rows: int) -> Array:
-    """Apply a linear layer to each pair's two similarities `[B, N, M]`, and take the maximum over targets: `[B, N, C]`.
-
-    Only the pairs that have the maximum are differentiated.
-    """
+    """Apply a linear layer to each pair's two similarities `[B, N, M]`, and take the maximum over targets: `[B, N, C]`."""
     kernel, bias = parameters
     assert bias is not None
+    return _largest_sum(kernel, feature, coordinate, rows) + channels(bias, 3)
+
+
+@functools.partial(jax.custom_jvp, nondiff_argnums=(3,))
+def _largest_sum(kernel: Array, feature: Array, coordinate: Array, rows: int) -> Array:
+    """Return the maximum over targets of `kernel[0] feature_ij + kernel[1] coordinate_ij`, without its values at all pairs."""
+    return _over_targets(jnp.max, kernel, feature, coordinate, rows)
+
+
+@_largest_sum.defjvp
+def _largest_sum_jvp(rows: int, primals: tuple[Array, ...], tangents: tuple[Array, ...]) -> tuple[Array, Array]:
+    """Differentiate only the pairs that have the maximum."""
+    kernel, feature, coordinate = primals
+    index = _over_targets(jnp.argmax, kernel, feature, coordinate, rows)
+
+    def at_best(kernel: Array, feature: Array, coordinate: Array) -> Array:
+        own, other = (jnp.take_along_axis(x, index, axis=2) for x in (feature, coordinate))
+        return own * channels(kernel[0], 3) + other * channels(kernel[1], 3)
+
+    return jax.jvp(at_best, primals, tangents)
+
+
+def _over_targets(reduce: Callable[..., Array], kernel: Array, feature: Array, coordinate: Array, rows: int) -> Array:
+    """Reduce `kernel[0] feature_ij + kernel[1] coordinate_ij`, `[B, N, M, C]`, over M, a chunk of rows at a time."""
     B, N, M = feature.shape
-    split = chunks_of(B, N, M, CREDIBILITY_WIDTH, rows)
+    split = chunks_of(B, N, M, kernel.shape[-1], rows)
 
-    def best(chunk: tuple[Array, Array]) -> Array:
-        own, other = (row[None, None, None, :] for row in jax.lax.stop_gradient(kernel))
-        return jnp.argmax(chunk[0][..., None] * own + chunk[1][..., None] * other, axis=2)
+    def visit(chunk: tuple[Array, Array]) -> Array:
+        return reduce(chunk[0][..., None] * channels(kernel[0], 4) + chunk[1][..., None] * channels(kernel[1], 4), axis=2)
 
-    index = joined(jax.lax.map(best, jax.lax.stop_gradient((split(feature), split(coordinate)))))
-    at_best = [jnp.take_along_axis(x, index, axis=2) * channels(row, 3) for x, row in zip((feature, coordinate), kernel, strict=True)]
-    return at_best[0] + at_best[1] + channels(bias, 3)
+    return joined(jax.lax.map(visit, (split(feature), split(coordinate))))
 
 
 def pair_distances(a: Array, b: Array) -> Array:

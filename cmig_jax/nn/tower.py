@@ -22,7 +22,7 @@ from cmig_jax.nn.norm import Affine, BatchNorm, Moments, channels, moments
 from cmig_jax.nn.pairs import PairSum, PairTerm
 
 # Numbers per chunk: what a CPU's cache holds; an accelerator wants large kernels.
-NUMBERS_AT_A_TIME = {"cpu": 2**20}
+NUMBERS_AT_A_TIME = {"cpu": 2**21}
 NUMBERS_ON_ACCELERATORS = 2**28
 
 # (shared, chunk) -> a hidden layer's values before their ReLU, `[B, R, M, C]`

@@ -1,6 +1,7 @@
 """The benchmark, tiny: its keys, finite ratios, and that both networks do the same work."""
 
 import functools
+import io
 import json
 import math
 import os
@@ -13,8 +14,9 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from cmig_jax.bench.__main__ import has_gpu
-from cmig_jax.bench.cases import CASES, make_arrays
+from cmig_jax.bench import worker
+from cmig_jax.bench.__main__ import case_lines, has_gpu
+from cmig_jax.bench.cases import CASES, case_of, make_arrays
 from cmig_jax.bench.clock import KEPT, OURS, PYTORCH, Timing, in_turns
 from cmig_jax.bench.clouds import measure_clouds
 from cmig_jax.bench.memory import resident
@@ -63,6 +65,7 @@ def test_no_repetitions_is_an_error():
     ("flags", "message"),
     [
         (["--clouds", "3"], "--clouds 3: expected at least 256"),
+        (["--pairs", "4", "0"], "--pairs 0: expected at least 1"),
         (["--json", "none/a.json"], "--json none/a.json: expected a file in a folder that is there"),
         (["--device", "gpu"], "finds none"),
     ],
@@ -126,6 +129,55 @@ def test_the_products_of_a_step_are_counted_through_loops_and_derivatives():
 
 def test_a_large_product_takes_time():
     assert 1e8 < product_rate(jnp.float32) < 1e16
+
+
+def test_work_that_does_not_fit_into_memory_is_left_out():
+    asked = []
+
+    def too_large():
+        asked.append(PYTORCH)
+
+    timing = in_turns({PYTORCH: too_large, OURS: lambda: 2.0}, 3)
+    assert asked == [PYTORCH]
+    assert timing.as_json() == {"ours_s": 2, "spread": 1}
+    assert in_turns({PYTORCH: too_large}, 3) | Timing({OURS: 2.0}, spread=1.5) == Timing({OURS: 2.0}, spread=1.5)
+
+
+def test_what_has_no_number_is_a_dash():
+    rows = {"whole": {"ours_s": 0.5, "operations": 2e9, "bytes": 1e9, "floor_s": 0.25, "spread": 1.0}}
+    result = {"inference": rows, "training": {"whole": {"spread": 1.0}}, "memory": {"ours_peak_gb": 3.0}}
+    lines = case_lines("tiny:4", result | {"product_rate": 8e9, "compile_s": {"inference": 1.0}})
+    assert lines[0].startswith("tiny:4: 4 pairs of 24 points")
+    assert lines[2].split() == ["inference", "whole", "-", "-", "0.500", "125.00", "-", "-", "2.0", "1.00", "0.250"]
+    assert lines[3].split() == ["training", "whole", *["-"] * 9]
+    assert lines[4].split() == ["peak", "memory,", "training", "-", "GB", "3.00", "GB", "-"]
+
+
+def allocate_with_torch():
+    import torch
+
+    torch.empty(2**60, dtype=torch.uint8)
+
+
+@pytest.mark.parametrize("allocate", [lambda: bytearray(2**60), allocate_with_torch, lambda: jax.block_until_ready(jnp.zeros(2**50))])
+def test_a_worker_goes_on_where_memory_does_not_suffice(allocate, monkeypatch, capsys):
+    class Network:
+        def training(self):
+            return allocate
+
+        def inference(self):
+            return lambda: None
+
+    monkeypatch.setattr("sys.stdin", io.StringIO("training whole\ninference whole\n"))
+    worker.main(Network())
+    refused, done = capsys.readouterr().out.splitlines()
+    assert json.loads(refused) is None
+    assert json.loads(done) >= 0
+
+
+def test_a_case_has_its_own_batch_or_the_one_asked_for():
+    assert case_of("paper") == CASES["paper"]
+    assert (case_of("paper:16").pairs, case_of("paper:16").sizes) == (16, CASES["paper"].sizes)
 
 
 def test_inputs_are_a_function_of_the_seed():

@@ -12,7 +12,7 @@ from typing import Any, Literal
 import jax
 import tyro
 
-from cmig_jax.bench.cases import CASES
+from cmig_jax.bench.cases import CASES, case_of
 from cmig_jax.bench.clouds import measure_clouds
 from cmig_jax.bench.run import run
 from cmig_jax.compilation import keep_compiled_programs
@@ -29,6 +29,7 @@ def main(
     compute: ComputeConfig = DEFAULT,
     stages: bool = True,
     memory: bool = True,
+    pairs: tuple[int, ...] = (),
     clouds: tuple[int, ...] = (),
     json: Path | None = None,
 ) -> None:
@@ -42,11 +43,14 @@ def main(
         compute: how our network computes.
         stages: also time every stage alone.
         memory: also take peak memory, in separate processes.
+        pairs: batch sizes to measure every case at (`paper:16`, ...); its own if not given.
         clouds: instead, register clouds of these sizes with our network (`--compute.rows` is 512 if not given) and print time and memory.
         json: file to write the results to.
     """
     if repetitions < 1:
         sys.exit(f"error: --repetitions {repetitions}: expected at least 1")
+    if pairs and min(pairs) < 1:
+        sys.exit(f"error: --pairs {min(pairs)}: expected at least 1")
     if clouds and min(clouds) < (fewest := CASES["points"].sizes.keypoints):
         sys.exit(f"error: --clouds {min(clouds)}: expected at least {fewest} points, the network's keypoints")
     if json is not None and not json.parent.is_dir():
@@ -60,7 +64,7 @@ def main(
         cache = keep_compiled_programs()
         print(f"persistent compilation cache: {cache}")
         results = {}
-        for name in cases:
+        for name in [f"{case}:{count}" for case in cases for count in pairs] or cases:
             results[name] = run(name, repetitions, device, compute, memory, stages)
             print("\n".join(case_lines(name, results[name])), flush=True)
     if json is not None:
@@ -74,25 +78,34 @@ def has_gpu() -> bool:
 
 
 def case_lines(name: str, result: dict[str, Any]) -> list[str]:
-    """Write a case as a table."""
-    case = CASES[name]
+    """Write a case as a table; what does not fit into memory has no number."""
+    case = case_of(name)
     images = f"{case.views} views of {case.image_size} x {case.image_size}" if case.images else "image features given"
     lines = [f"{name}: {case.pairs} pairs of {case.points} points, {images}, K = {case.sizes.keypoints}, n = {case.sizes.iterations}"]
-    lines.append(f"  {'':26} {'PyTorch s':>10} {'kept s':>8} {'ours s':>8} {'ratio':>6} {'kept':>6} {'Gop':>7} {'GB':>6} {'floor s':>8}")
+    columns = (("PyTorch s", 10, 3), ("kept s", 8, 3), ("ours s", 8, 3), ("ms a pair", 10, 2), ("ratio", 6, 2), ("kept", 6, 2))
+    columns += (("Gop", 8, 1), ("GB", 7, 2), ("floor s", 8, 3))
+    lines.append("  " + " ".join((f"{'':26}", *(f"{title:>{width}}" for title, width, _ in columns))))
     for mode in ("inference", "training"):
         for what, row in result[mode].items():
-            kept = row.get("pytorch_kept_s", row["pytorch_s"])
-            numbers = f"{row['pytorch_s']:10.3f} {kept:8.3f} {row['ours_s']:8.3f} {row['ratio']:6.2f} {kept / row['ours_s']:6.2f}"
-            products = f"{row['operations'] / 1e9:7.1f} {row['bytes'] / 1e9:6.2f} {row['floor_s']:8.3f}"
-            lines.append(f"  {mode + ' ' + what:26} {numbers} {products}")
+            numbers = [row.get(key) for key in ("pytorch_s", "pytorch_kept_s", "ours_s")]
+            numbers.append(row["ours_s"] / case.pairs * 1e3 if "ours_s" in row else None)
+            numbers += [row.get("ratio"), row.get("ratio_kept")]
+            numbers += [row[key] / 1e9 if key in row else None for key in ("operations", "bytes")] + [row.get("floor_s")]
+            cells = [_cell(number, width, digits) for number, (_, width, digits) in zip(numbers, columns, strict=True)]
+            lines.append("  " + " ".join((f"{mode + ' ' + what:26}", *cells)))
     for what, key in (("training", "memory"), ("inference", "memory_inference")):
         if key in result:
             row = result[key]
-            lines.append(f"  peak memory, {what:13} {row['pytorch_gb']:7.2f} GB {row['ours_gb']:7.2f} GB {row['ratio']:7.2f}")
+            theirs, ours, ratio = (_cell(row.get(field), 7, 2) for field in ("pytorch_peak_gb", "ours_peak_gb", "ratio"))
+            lines.append(f"  peak memory, {what:13} {theirs} GB {ours} GB {ratio}")
     rate = result["product_rate"] / 1e9
     lines.append(f"  Gop, GB: of our products, read and written once; floor: those at {rate:.0f} Gop/s, the rate of one large product here")
     compiled = ", ".join(f"{mode} {seconds:.1f} s" for mode, seconds in result["compile_s"].items())
     return [*lines, f"  compilation (ours, or its reading from the cache): {compiled}"]
+
+
+def _cell(number: float | None, width: int, digits: int) -> str:
+    return f"{'-':>{width}}" if number is None else f"{number:{width}.{digits}f}"
 
 
 def cloud_lines(rows: list[dict[str, float]]) -> list[str]:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -82,6 +82,12 @@ CASES = {
     "quickstart": Case(SMALL_NETWORK, pairs=16, points=192, views=6, image_size=32),
     "tiny": Case(TINY_NETWORK, pairs=2, points=24, views=2, image_size=16),
 }
+
+
+def case_of(name: str) -> Case:
+    """Find a case by its name; `paper:16` is `paper` in batches of 16 pairs."""
+    name, _, pairs = name.partition(":")
+    return replace(CASES[name], pairs=int(pairs)) if pairs else CASES[name]
 
 
 def make_arrays(case: Case, seed: int = 0) -> Arrays:

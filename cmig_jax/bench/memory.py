@@ -8,7 +8,7 @@ import sys
 from pathlib import Path
 from typing import Any, Literal
 
-from cmig_jax.bench.worker import Who, arguments, network_of
+from cmig_jax.bench.worker import Who, arguments, is_out_of_memory, network_of
 from cmig_jax.config import ComputeConfig
 
 
@@ -24,7 +24,7 @@ def measure(case: str, who: Who, what: str, device: str, compute: ComputeConfig)
 
     Returns:
         `peak_gb`, the largest resident memory of the process (of the device, on a GPU), and `above_runtime_gb`, without what the process
-        held once libraries, weights and inputs were loaded.
+        held once libraries, weights and inputs were loaded; nothing if memory does not suffice.
     """
     return in_a_process("cmig_jax.bench.memory", what, *arguments(case, who, device, compute))
 
@@ -47,9 +47,14 @@ def resident(field: Literal["VmHWM", "VmRSS"]) -> int:
 def main(what: str, network: Any, device: str) -> dict[str, float]:
     """Do it twice in this process; return the peaks."""
     before = resident("VmRSS")
-    work = getattr(network, what)()
-    work()
-    work()
+    try:
+        work = getattr(network, what)()
+        work()
+        work()
+    except Exception as error:
+        if not is_out_of_memory(error):
+            raise
+        return {}
     peak = network.peak_bytes() if device == "gpu" else resident("VmHWM")
     return {"peak_gb": peak / 1e9, "above_runtime_gb": (peak - (0 if device == "gpu" else before)) / 1e9}
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import jax
 
-from cmig_jax.bench.cases import CASES, make_arrays
+from cmig_jax.bench.cases import case_of, make_arrays
 from cmig_jax.bench.ours import Ours
 from cmig_jax.compilation import keep_compiled_programs
 from cmig_jax.config import ComputeConfig
@@ -17,12 +17,14 @@ def make_ours(name: str, device: str, compute: ComputeConfig | None = None) -> O
     """Build our network on a case's inputs."""
     keep_compiled_programs()
     jax.config.update("jax_platforms", "cuda" if device == "gpu" else "cpu")
-    return Ours(CASES[name], make_arrays(CASES[name]), compute)
+    case = case_of(name)
+    return Ours(case, make_arrays(case), compute)
 
 
 def make_twin(name: str, device: str) -> TwinBench:
     """Build the twin on a case's inputs, with the same weights."""
-    case, arrays = CASES[name], make_arrays(CASES[name])
+    case = case_of(name)
+    arrays = make_arrays(case)
     images = arrays.views if case.images else arrays.image_features
     state = named_weights(state_shapes(case.sizes), seed=0)
     return TwinBench(

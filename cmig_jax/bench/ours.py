@@ -15,6 +15,7 @@ from jax import Array
 from cmig_jax.allocator import return_freed_memory
 from cmig_jax.bench.cases import Arrays, Case
 from cmig_jax.bench.products import product_rate, products_of
+from cmig_jax.compilation import finished
 from cmig_jax.config import ComputeConfig, Config
 from cmig_jax.nn.build import build
 from cmig_jax.nn.cmignet import CMIGNet, _gather
@@ -92,7 +93,7 @@ class Ours:
         def work() -> Array:
             nonlocal state
             state, scalars = step(state, self.batch, key)
-            return scalars["loss"].block_until_ready()
+            return finished(scalars)["loss"]
 
         return work
 
@@ -135,7 +136,7 @@ class Ours:
 
     def _compiled(self, name: str, function: Any, arguments: tuple[Any, ...]) -> Work:
         program = self._program(name, function, arguments)
-        return lambda: jax.block_until_ready(program(*arguments))
+        return lambda: finished(program(*arguments))
 
     def _program(self, name: str, function: Any, arguments: tuple[Any, ...]) -> Any:
         """Compile a `jax.jit` function for these arguments, and note what that took and what its products come to."""

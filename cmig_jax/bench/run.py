@@ -8,8 +8,8 @@ from typing import Any
 
 from tqdm import tqdm
 
-from cmig_jax.bench.cases import CASES
-from cmig_jax.bench.clock import KEPT, OURS, PYTORCH, in_turns
+from cmig_jax.bench.cases import case_of
+from cmig_jax.bench.clock import KEPT, OURS, PYTORCH, Timing, in_turns
 from cmig_jax.bench.memory import measure
 from cmig_jax.bench.worker import Who, Worker
 from cmig_jax.config import ComputeConfig
@@ -28,7 +28,8 @@ def run(name: str, repetitions: int, device: str, compute: ComputeConfig, memory
 
     Returns:
         `inference` and `training`, each with `whole` and the stages (`Timing.as_json`, ours' costs, and `floor_s`, what the products alone
-        would take at `product_rate`), `memory` of a training step, `memory_inference`, and `compile_s`.
+        would take at `product_rate`), `memory` of a training step, `memory_inference`, and `compile_s`. What does not fit into memory
+        has no numbers.
     """
     results = _times(name, repetitions, device, compute, stages)
     if memory:
@@ -37,30 +38,28 @@ def run(name: str, repetitions: int, device: str, compute: ComputeConfig, memory
 
 
 def _times(name: str, repetitions: int, device: str, compute: ComputeConfig, stages: bool) -> dict[str, Any]:
-    networks: tuple[Who, ...] = (PYTORCH, KEPT, OURS) if device == "cpu" else (PYTORCH, OURS)
-    whats = ["whole", *(CASES[name].stages if stages else ())]
-    results: dict[str, Any] = {"inference": {}, "training": {}}
-    with contextlib.ExitStack() as stack:
-        workers = {who: stack.enter_context(Worker(name, who, device, compute)) for who in networks}
-        for mode, found in results.items():
-            for what in tqdm(whats, desc=f"{name} {mode}", leave=False, disable=None):
+    # On a GPU one after the other, so that each has all the memory.
+    together: list[tuple[Who, ...]] = [(PYTORCH, KEPT, OURS)] if device == "cpu" else [(PYTORCH,), (OURS,)]
+    whats = [(mode, what) for mode in ("inference", "training") for what in ("whole", *(case_of(name).stages if stages else ()))]
+    timings, ours = dict.fromkeys(whats, Timing({}, 1.0)), {}
+    for networks in together:
+        with contextlib.ExitStack() as stack:
+            workers = {who: stack.enter_context(Worker(name, who, device, compute)) for who in networks}
+            for mode, what in tqdm(whats, desc=f"{name} {', '.join(networks)}", leave=False, disable=None):
                 works = {who: functools.partial(worker, f"{mode} {what}") for who, worker in workers.items()}
-                found[what] = in_turns(works, repetitions).as_json()
-        ours = workers[OURS].costs()
-    for mode in ("inference", "training"):
-        for what, row in results[mode].items():
-            row |= ours["costs"][mode if what == "whole" else f"{mode}.{what}"]
-            row["floor_s"] = row["operations"] / ours["product_rate"]
-    compile_s = {mode: ours["compile_seconds"][mode] for mode in ("inference", "training")}
+                timings[mode, what] |= in_turns(works, repetitions)
+            if OURS in workers:
+                ours = workers[OURS].costs()
+    results: dict[str, Any] = {"inference": {}, "training": {}}
+    for (mode, what), timing in timings.items():
+        results[mode][what] = timing.as_json()
+        if costs := ours["costs"].get(mode if what == "whole" else f"{mode}.{what}"):
+            results[mode][what] |= costs | {"floor_s": costs["operations"] / ours["product_rate"]}
+    compile_s = {mode: ours["compile_seconds"][mode] for mode in results if mode in ours["compile_seconds"]}
     return results | {"compile_s": compile_s, "product_rate": ours["product_rate"]}
 
 
 def _memory(name: str, what: str, device: str, compute: ComputeConfig) -> dict[str, float]:
-    theirs, ours = (measure(name, who, what, device, compute) for who in (PYTORCH, OURS))
-    return {
-        "ratio": theirs["peak_gb"] / ours["peak_gb"],
-        "pytorch_gb": theirs["peak_gb"],
-        "ours_gb": ours["peak_gb"],
-        "pytorch_above_runtime_gb": theirs["above_runtime_gb"],
-        "ours_above_runtime_gb": ours["above_runtime_gb"],
-    }
+    peaks = {who: measure(name, who, what, device, compute) for who in (PYTORCH, OURS)}
+    found = {f"{who}_{field}": value for who, fields in peaks.items() for field, value in fields.items()}
+    return found | ({"ratio": peaks[PYTORCH]["peak_gb"] / peaks[OURS]["peak_gb"]} if all(peaks.values()) else {})

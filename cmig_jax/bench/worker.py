@@ -20,6 +20,7 @@ from cmig_jax.config import ComputeConfig
 
 Who = Literal["pytorch", "pytorch_kept", "ours"]
 COSTS = "costs"
+WARM_UP = 2  # after one call the heap still grows: the next takes up to half as long again
 
 
 class Worker:
@@ -38,8 +39,11 @@ class Worker:
         self._name = f"{who} ({case})"
         self._process = subprocess.Popen(command, env=environment, stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True, bufsize=1)
 
-    def __call__(self, work: str) -> float:
-        """Do a piece of work (`inference whole`, `training fusion`, ...) and return its seconds; the first time also once before."""
+    def __call__(self, work: str) -> float | None:
+        """Do a piece of work (`inference whole`, `training fusion`, ...) and return its seconds; the first time also twice before.
+
+        Returns None where the memory does not suffice.
+        """
         return self._ask(work)
 
     def costs(self) -> dict[str, Any]:
@@ -86,19 +90,36 @@ def main(network: Any) -> None:
     for line in sys.stdin:
         name = line.strip()
         if name == COSTS:
-            known = {"compile_seconds": network.compile_seconds, "costs": network.costs, "product_rate": network.product_rate()}
-            print(json.dumps(known), flush=True)
-            continue
-        if name not in works:
-            mode, what = name.split()
-            if what == "whole":
-                works[name] = getattr(network, mode)()
-            else:
-                works |= {f"{mode} {stage}": work for stage, work in network.stages(mode == "training").items()}
+            answer: Any = {"compile_seconds": network.compile_seconds, "costs": network.costs, "product_rate": network.product_rate()}
+        else:
+            try:
+                answer = _seconds(network, works, name)
+            except Exception as error:
+                if not is_out_of_memory(error):
+                    raise
+                print(f"{name}: {error}", file=sys.stderr)
+                answer = None
+        print(json.dumps(answer), flush=True)
+
+
+def _seconds(network: Any, works: dict[str, Any], name: str) -> float:
+    if name not in works:
+        mode, what = name.split()
+        if what == "whole":
+            works[name] = getattr(network, mode)()
+        else:
+            works |= {f"{mode} {stage}": work for stage, work in network.stages(mode == "training").items()}
+        for _ in range(WARM_UP):
             works[name]()
-        start = time.perf_counter()
-        works[name]()
-        print(time.perf_counter() - start, flush=True)
+    start = time.perf_counter()
+    works[name]()
+    return time.perf_counter() - start
+
+
+def is_out_of_memory(error: Exception) -> bool:
+    """Whether PyTorch, JAX or Python says that memory does not suffice: each has an error of its own."""
+    said = ("RESOURCE_EXHAUSTED", "can't allocate memory")
+    return isinstance(error, MemoryError) or type(error).__name__ == "OutOfMemoryError" or any(text in str(error) for text in said)
 
 
 if __name__ == "__main__":

@@ -9,6 +9,7 @@ import jax
 import numpy as np
 from jax.sharding import Mesh
 
+from cmig_jax.compilation import finished
 from cmig_jax.data.loader import stack
 from cmig_jax.data.pairs import Pair
 from cmig_jax.nn.cmignet import CMIGNet
@@ -63,7 +64,7 @@ class Predictor:
             first = min(start + process * share, len(pairs) - 1)
             drawn = [pairs[i] for i in range(first, min(first + share, len(pairs)))]
             filled = drawn + [drawn[-1]] * (share - len(drawn))
-            jax.block_until_ready(results[-1:])  # one batch at a time on the devices, while the next one is drawn
+            finished(results[-1:])  # one batch at a time on the devices, while the next one is drawn
             results.append(self._poses(variables, to_device(stack(filled), self._mesh)))
         return results
 

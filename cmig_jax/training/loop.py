@@ -144,7 +144,7 @@ class _Run:
             self.state, scalars = self.update(self.state, to_device(arrays, self.mesh), self.key)
             self.step += 1
             stopping = self.vote(stop.is_set())
-            # Read a step's numbers only when the next one is under way, so that the device never waits for the host.
+            # Read a step's numbers only when the next one is under way, so that an accelerator never waits for the host.
             self._settle(log)
             self.pending = (self.step, scalars, arrays)
             at_end = self.step == self.total or self.step % every == 0

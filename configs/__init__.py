@@ -1,12 +1,16 @@
-"""The presets: every one a function that returns a `Config`. `python train.py --help` lists them."""
+"""The presets by name: functions that return a `Config`. `cmig train --help` lists them.
+
+Installed, this folder is the package `cmig_jax.presets`.
+"""
 
 from __future__ import annotations
 
 from collections.abc import Callable
 
 from cmig_jax.config import Config
-from configs.modelnet40 import corrected, corrected_cpu, modelnet40_cpu, paper, paper_cpu, released, released_cpu
-from configs.quickstart import own_clouds, quickstart
+
+from .modelnet40 import corrected, corrected_cpu, modelnet40_cpu, paper, paper_cpu, released, released_cpu
+from .quickstart import own_clouds, quickstart
 
 PRESETS: dict[str, Callable[[], Config]] = {
     "quickstart": quickstart,

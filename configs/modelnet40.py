@@ -4,61 +4,32 @@ from __future__ import annotations
 
 from dataclasses import replace
 
-from cmig_jax.config import (
-    Config,
-    DataConfig,
-    FusionConfig,
-    KeypointsConfig,
-    LossConfig,
-    MatchingConfig,
-    OptimConfig,
-    PoseConfig,
-    ViewsConfig,
-)
-from configs.quickstart import quickstart
-from configs.scale import at_cpu_scale
+from cmig_jax.config import Config, DataConfig, OptimConfig, ViewsConfig
+from cmig_jax.models.cmignet import flags as cmignet
+
+from .quickstart import quickstart
+from .scale import at_cpu_scale
 
 
 def paper() -> Config:
     """The paper's text; where it is silent, the released network."""
-    return Config(name="paper")
+    return Config(name="paper", model=cmignet.paper())
 
 
 def released() -> Config:
-    """The numbers of the released PyTorch network."""
-    base = paper()
-    return replace(
-        base,
-        name="released",
-        model=replace(
-            base.model,
-            fusion=FusionConfig(image="transformer"),
-            keypoints=KeypointsConfig(score_from="other", activation="sigmoid"),
-            pose=PoseConfig(centroid="unweighted"),
-        ),
-        loss=LossConfig(overlap="off", overlap_mean="active", cross_modal="nt-xent", credibility_label="index", match_mean="positive"),
-    )
+    """The settings of the released PyTorch network."""
+    return Config(name="released", model=cmignet.released())
 
 
 def corrected() -> Config:
-    """Ours, what measurement supports: observed views as tokens, no predicted keypoints, soft partners; at test all points, repeated."""
-    base = released()
-    return replace(
-        base,
-        name="corrected",
-        views=ViewsConfig(of="both"),
-        model=replace(
-            base.model,
-            fusion=FusionConfig(image="views"),
-            keypoints=KeypointsConfig(select="random", test_count=768),
-            matching=MatchingConfig(repeats=5, correspondence="soft"),
-        ),
-    )
+    """Ours: observed views as tokens, no predicted keypoints, soft correspondences; at test all points, repeated."""
+    return Config(name="corrected", views=ViewsConfig(of="both"), model=cmignet.corrected())
 
 
 def modelnet40_cpu() -> Config:
     """The network of `quickstart` on ModelNet40: trains on two cores within an hour, on the unseen-category protocol."""
     small = quickstart()
+    assert isinstance(small.model, cmignet.CMIGNetFlags)
     return replace(
         small,
         name="modelnet40-cpu",
@@ -69,7 +40,7 @@ def modelnet40_cpu() -> Config:
 
 
 def paper_cpu() -> Config:
-    """`paper` at the size that the experiments have on two cores: minutes for a training, for comparisons only."""
+    """`paper` at the size of the experiments on two cores: minutes per training, for comparisons only."""
     return replace(at_cpu_scale(paper()), name="paper-cpu")
 
 

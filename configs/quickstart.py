@@ -4,18 +4,15 @@ from __future__ import annotations
 
 from dataclasses import replace
 
-from cmig_jax.config import (
-    Config,
-    DataConfig,
-    FusionConfig,
-    ImageConfig,
-    KeypointsConfig,
-    LossConfig,
-    MatchingConfig,
-    ModelConfig,
-    OptimConfig,
-    PointsConfig,
-    ViewsConfig,
+from cmig_jax.config import Config, DataConfig, OptimConfig, ViewsConfig
+from cmig_jax.models.cmignet.flags import (
+    CMIGNetFlags,
+    FusionFlags,
+    ImageFlags,
+    KeypointsFlags,
+    LossFlags,
+    MatchingFlags,
+    PointsFlags,
 )
 
 
@@ -26,17 +23,15 @@ def quickstart() -> Config:
         data=DataConfig(source="shapes", shapes=40, points=256, categories="first-half", test_categories="second-half"),
         views=ViewsConfig(of="both", count=6, size=32, layout="axes"),
         model=small_network(),
-        loss=LossConfig(cross_modal="nt-xent", overlap="off", match_mean="positive"),
         optim=OptimConfig(learning_rate=2e-3, weight_decay=1e-5, schedule="cosine", epochs=10, batch=16, clip_norm=5.0, validate_every=2),
     )
 
 
 def own_clouds() -> Config:
     """The network that comes with the package: generated objects, each cloud sampled and cropped on its own, turned to either side."""
-    base = quickstart()
     model = small_network()
     return replace(
-        base,
+        quickstart(),
         name="own-clouds",
         data=DataConfig(source="shapes", shapes=80, points=512, sampling="twice", crop="independent", turn="either"),
         model=replace(
@@ -47,12 +42,13 @@ def own_clouds() -> Config:
     )
 
 
-def small_network() -> ModelConfig:
+def small_network() -> CMIGNetFlags:
     """128 channels and 64 keypoints; observed views as tokens, each cloud's own linear scores, weighted centroids; at test all points."""
-    return ModelConfig(
-        points=PointsConfig(k=16, widths=(32, 32, 64, 64), dim=128),
-        image=ImageConfig(widths=(16, 32, 64, 128), blocks=(1, 1, 1, 1)),
-        fusion=FusionConfig(image="views", feed_forward=256),
-        keypoints=KeypointsConfig(count=64, test_count=192),
-        matching=MatchingConfig(feature_widths=(64, 32, 32), repeats=5),
+    return CMIGNetFlags(
+        points=PointsFlags(k=16, widths=(32, 32, 64, 64), dim=128),
+        image=ImageFlags(widths=(16, 32, 64, 128), blocks=(1, 1, 1, 1)),
+        fusion=FusionFlags(image="views", feed_forward=256),
+        keypoints=KeypointsFlags(count=64, test_count=192),
+        matching=MatchingFlags(feature_widths=(64, 32, 32), repeats=5),
+        loss=LossFlags(cross_modal="nt-xent", overlap=False, match_mean="positive"),
     )

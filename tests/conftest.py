@@ -1,7 +1,7 @@
-"""Eight virtual CPU devices, programs compiled in haste, rank promotion an error. And a network, clouds and a run that take seconds."""
+"""Eight virtual CPU devices, programs compiled quickly, rank promotion an error; and a network, clouds and a run that take seconds."""
 
 import dataclasses
-import importlib.util
+import functools
 import os
 import subprocess
 import sys
@@ -16,20 +16,21 @@ os.environ["XLA_FLAGS"] = os.environ.get("XLA_FLAGS", "") + " --xla_force_host_p
 os.environ["JAX_PLATFORMS"] = "cpu"
 import jax
 
-from cmig_jax.config import (
-    Config,
-    DataConfig,
-    FusionConfig,
-    ImageConfig,
-    KeypointsConfig,
-    LossConfig,
-    MatchingConfig,
-    ModelConfig,
-    OptimConfig,
-    PointsConfig,
-    ViewsConfig,
-)
+from cmig_jax import cli
+from cmig_jax.config import Config, DataConfig, OptimConfig, ViewsConfig
+from cmig_jax.config_json import flat
 from cmig_jax.data.prepare import prepare
+from cmig_jax.experiments.plan import command_line as as_flags
+from cmig_jax.models.cmignet.flags import (
+    CMIGNetFlags,
+    FusionFlags,
+    ImageFlags,
+    KeypointsFlags,
+    LossFlags,
+    MatchingFlags,
+    PointsFlags,
+)
+from configs.catalogue import catalogue
 
 jax.config.update("jax_numpy_rank_promotion", "raise")
 
@@ -67,18 +68,37 @@ def tiny(clouds, tmp_path_factory) -> Config:
         name="tiny",
         data=DataConfig(source="modelnet40-hdf5", root=str(clouds), points=48, validation=0.25),
         views=ViewsConfig(of="both", count=6, size=16, layout="axes"),
-        model=ModelConfig(
-            points=PointsConfig(k=6, widths=(8, 8), dim=16),
-            image=ImageConfig(widths=(4, 16), blocks=(1, 1)),
-            fusion=FusionConfig(image="views", heads=2, feed_forward=16),
-            keypoints=KeypointsConfig(count=16),
-            matching=MatchingConfig(iterations=1, feature_widths=(8,), coordinate_widths=(8,)),
+        model=CMIGNetFlags(
+            points=PointsFlags(k=6, widths=(8, 8), dim=16),
+            image=ImageFlags(widths=(4, 16), blocks=(1, 1)),
+            fusion=FusionFlags(image="views", heads=2, feed_forward=16),
+            keypoints=KeypointsFlags(count=16),
+            matching=MatchingFlags(iterations=1, feature_widths=(8,), coordinate_widths=(8,)),
+            loss=LossFlags(cross_modal="nt-xent", match_mean="positive"),
         ),
-        loss=LossConfig(cross_modal="nt-xent", match_mean="positive"),
         optim=OptimConfig(learning_rate=1e-3, epochs=4, batch=8, milestones=(2,), validate_every=2),
     )
-    prepared = prepare(config, tmp_path_factory.mktemp("prepared"), workers=1, progress=False)
+    prepared = prepare(config.data, config.views, tmp_path_factory.mktemp("prepared"), workers=1, progress=False)
     return dataclasses.replace(config, data=dataclasses.replace(config.data, prepared=str(prepared)))
+
+
+@pytest.fixture(scope="session")
+def random_variables():
+    """Return a function that draws variables with NumPy: no initialisation to compile, and no trivial normalisation."""
+
+    def draw(module, *inputs, seed=0, dtype=np.float64, **options):
+        rng = np.random.default_rng(seed)
+
+        def leaf(path, shape):
+            if path[-1].key in ("scale", "var"):
+                return rng.uniform(0.5, 1.5, shape.shape).astype(dtype)
+            fan_in = np.prod(shape.shape[:-1]) if path[-1].key == "kernel" else 10
+            return (rng.normal(size=shape.shape) / np.sqrt(fan_in)).astype(dtype)
+
+        shapes = jax.eval_shape(functools.partial(module.init, **options), jax.random.key(0), *inputs)
+        return jax.tree_util.tree_map_with_path(leaf, shapes)
+
+    return draw
 
 
 @pytest.fixture(scope="session")
@@ -95,19 +115,12 @@ def command_line():
 
 @pytest.fixture
 def main(capsys, monkeypatch):
-    """Run the `main` of one of the scripts here, which saves the seconds that a process takes to start."""
+    """Run a command in this process, which saves the seconds that a process takes to start."""
     monkeypatch.setenv("COLUMNS", "100")
 
-    def run(script: str, *arguments: object) -> subprocess.CompletedProcess[str]:
-        spec = importlib.util.spec_from_file_location(Path(script).stem, ROOT / script)
-        assert spec is not None
-        assert spec.loader is not None
-        module = importlib.util.module_from_spec(spec)
-        monkeypatch.setitem(sys.modules, spec.name, module)
-        spec.loader.exec_module(module)
-        monkeypatch.setattr(sys, "argv", [script])
+    def run(name: str, *arguments: object) -> subprocess.CompletedProcess[str]:
         try:
-            code = module.main([str(argument) for argument in arguments])
+            code = cli.main([name, *map(str, arguments)], catalogue)
         except SystemExit as exit:
             code = exit.code
         printed = capsys.readouterr()
@@ -119,22 +132,7 @@ def main(capsys, monkeypatch):
 @pytest.fixture(scope="session")
 def flags():
     """Write a config as the flags of a command line."""
-
-    def write(config: Config) -> list[str]:
-        found: list[str] = []
-
-        def visit(value: object, path: str) -> None:
-            if dataclasses.is_dataclass(value):
-                for field in dataclasses.fields(value):
-                    visit(getattr(value, field.name), f"{path}.{field.name}".lstrip("."))
-            else:
-                values = value if isinstance(value, tuple) else (value,)
-                found.extend([f"--{path.replace('_', '-')}", *map(str, values)])
-
-        visit(config, "")
-        return found
-
-    return write
+    return lambda config: list(as_flags(flat(config)))
 
 
 @pytest.fixture(scope="session")

@@ -1,20 +1,24 @@
-"""Programs compiled at their first call."""
+"""Where compiled programs are kept."""
+
+from pathlib import Path
 
 import jax
-import jax.numpy as jnp
+import pytest
 
-from cmig_jax.compilation import compiled_first
+from cmig_jax.compilation import keep_compiled_programs
 
 
-def test_a_step_on_a_cpu_returns_once_it_is_done():
-    size = 1024
+@pytest.fixture(autouse=True)
+def settings_stay():
+    names = ("jax_compilation_cache_dir", "jax_persistent_cache_min_compile_time_secs")
+    before = {name: getattr(jax.config, name) for name in names}
+    yield
+    for name, value in before.items():
+        jax.config.update(name, value)
 
-    def step(x):
-        matrix = jnp.full((size, size), x)
-        for _ in range(8):
-            matrix = jax.lax.optimization_barrier(matrix @ matrix) / size
-        return jnp.sum(matrix)
 
-    call = compiled_first(jax.jit(step))
-    for x in (1.0, 0.5):
-        assert call(jnp.asarray(x)).is_ready()
+def test_the_folder_is_the_users_or_one_of_ours(monkeypatch):
+    monkeypatch.setenv("JAX_COMPILATION_CACHE_DIR", "/somewhere")
+    assert keep_compiled_programs() == "/somewhere"
+    monkeypatch.delenv("JAX_COMPILATION_CACHE_DIR")
+    assert keep_compiled_programs() == str(Path.home() / ".cache" / "cmig_jax" / "compiled")

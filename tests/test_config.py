@@ -1,56 +1,53 @@
-"""The schema: what it writes it reads, and what it refuses it names."""
+"""Configs: the rules of each group, JSON there and back, the layout from before networks had names, and imports without JAX."""
 
 import dataclasses
 import json
 import math
 import re
+import subprocess
+import sys
 
 import pytest
 
-from cmig_jax.config import Config, FusionConfig, ModelConfig, ViewsConfig, _rules, from_json, to_json
+import cmig_jax.config
+from cmig_jax.config import ComputeConfig, Config, DataConfig, OptimConfig, ViewsConfig
+from cmig_jax.config_json import differences, flat, to_json
+from cmig_jax.models.cmignet import flags as cmignet
+from cmig_jax.models.networks import config_from_json
 
-REFUSED = {
-    "name": ["", "../elsewhere", "/anywhere"],
-    "seed": [-1],
-    "data.max_translation": [-0.5, math.inf],
-    "data.test_seed": [-1],
-    "data.workers": [-1],
-    "model.points.widths": [(), (64, 0)],
-    "model.points.dim": [2],
-    "model.fusion.feed_forward": [0],
-    "model.matching.feature_widths": [()],
-    "model.matching.coordinate_widths": [(0,)],
-    "loss.overlap_threshold": [0.0],
-    "loss.match_threshold": [-0.05],
-    "loss.margins": [(-1.0, 3.0)],
-    "optim.weight_decay": [-1e-3],
-    "optim.milestones": [(0,), (50, 50), (75, 50)],
-    "optim.decay": [0.0, 2.0],
-    "optim.clip_norm": [-1.0],
-    "data.points": [0],
-    "data.keep": [0.0, 1.5, -0.1],
-    "data.noise_std": [-0.01, math.inf],
-    "data.noise_clip": [-0.05],
-    "data.max_angle_deg": [-1.0, 181.0],
-    "data.validation": [0.0, 1.0],
-    "data.shapes": [3],
-    "views.count": [12, 0],
-    "views.size": [7],
-    "model.points.k": [0, 769],
-    "model.keypoints.count": [1, 769],
-    "model.keypoints.test_count": [-1],
-    "model.image.widths": [(64, 128, 256, 511)],
-    "model.image.blocks": [(2, 2, 2)],
-    "model.fusion.heads": [0, 3],
-    "model.matching.iterations": [0],
-    "model.matching.repeats": [-1],
-    "loss.temperature": [0.0],
-    "optim.batch": [1],
-    "optim.epochs": [0],
-    "optim.validate_every": [0],
-    "optim.learning_rate": [0.0],
-    "compute.rows": [-1],
-}
+PAPER = Config(name="paper", model=cmignet.CMIGNetFlags())
+REFUSED_BY_GROUP = [
+    ("", {"name": ["", "../elsewhere", "/anywhere"], "seed": [-1]}),
+    ("data.", {"points": [0], "keep": [0.0, 1.5, -0.1], "validation": [0.0, 1.0], "shapes": [3], "test_seed": [-1], "workers": [-1]}),
+    ("data.", {"noise_std": [-0.01, math.inf], "noise_clip": [-0.05], "max_angle_deg": [-1.0, 181.0], "max_translation": [-0.5, math.inf]}),
+    ("views.", {"count": [12, 0], "size": [7]}),
+    ("model.points.", {"k": [0], "widths": [(), (64, 0)], "dim": [2]}),
+    ("model.image.", {"widths": [(64, 128, 256, 511)], "blocks": [(2, 2, 2)]}),
+    ("model.fusion.", {"heads": [0, 3], "feed_forward": [0]}),
+    ("model.keypoints.", {"count": [1], "test_count": [-1, 1]}),
+    ("model.matching.", {"iterations": [0], "repeats": [-1], "feature_widths": [()], "coordinate_widths": [(0,)]}),
+    ("model.loss.", {"overlap_threshold": [0.0], "match_threshold": [-0.05], "margins": [(-1.0, 3.0)], "temperature": [0.0]}),
+    ("optim.", {"learning_rate": [0.0], "weight_decay": [-1e-3], "decay": [0.0, 2.0], "clip_norm": [-1.0]}),
+    ("optim.", {"milestones": [(0,), (50, 50), (75, 50)], "epochs": [0], "batch": [0, 1], "validate_every": [0]}),
+    ("compute.", {"rows": [-1]}),
+]
+REFUSED = {group + name: values for group, flags in REFUSED_BY_GROUP for name, values in flags.items()}
+
+# A config that the version before `models/` wrote: losses at the top level, on and off, no name of a network.
+OLD_LAYOUT = """{"name": "old", "seed": 3,
+"data": {"source": "shapes", "root": null, "prepared": null, "categories": "all", "test_categories": "all", "exclude": ["cup"],
+"shapes": 40, "points": 512, "sampling": "twice", "keep": 0.75, "crop": "independent", "noise_std": 0.01, "noise_clip": 0.05,
+"max_angle_deg": 45.0, "turn": "either", "max_translation": 0.5, "validation": 0.1, "test_seed": 1234, "workers": 0},
+"views": {"of": "both", "count": 6, "size": 32, "layout": "axes", "shown": "real"},
+"model": {"points": {"k": 16, "widths": [32, 64], "dim": 128}, "image": {"widths": [16, 128], "blocks": [1, 1]},
+"fusion": {"points": "transformer", "image": "views", "heads": 4, "feed_forward": 256},
+"keypoints": {"select": "predicted", "count": 64, "test_count": 384, "score_from": "own", "activation": "linear"},
+"matching": {"head": "cmignet", "iterations": 3, "repeats": 5, "correspondence": "soft", "feature_widths": [64, 32],
+"coordinate_widths": [32, 32, 32]}, "pose": {"centroid": "unweighted", "gradient": "stopped"}},
+"loss": {"overlap": "off", "overlap_mean": "all", "margins": [1.0, 3.0], "overlap_threshold": 0.01, "match_threshold": 0.05,
+"cross_modal": "nt-xent", "temperature": 0.1, "credibility_label": "distance", "match_mean": "positive"},
+"optim": {"learning_rate": 0.002, "weight_decay": 0.001, "schedule": "cosine", "milestones": [50, 75], "decay": 0.5, "epochs": 100,
+"batch": 6, "clip_norm": 5.0, "validate_every": 1}, "compute": {"precision": "float32", "recompute": "on", "rows": 512}}"""
 
 
 def changed(config, flag, value):
@@ -59,9 +56,9 @@ def changed(config, flag, value):
     return dataclasses.replace(config, **{name: changed(getattr(config, name), rest, value) if rest else value})
 
 
-def edited(flag, edit):
-    """Write the default config as JSON with the object that holds `flag` edited."""
-    values = json.loads(to_json(Config()))
+def edited(flag, edit, text=None):
+    """Write a config (by default the paper's) as JSON with the object that holds `flag` edited."""
+    values = json.loads(text or to_json(PAPER))
     inner, path = values, flag.split(".")
     for name in path[:-1]:
         inner = inner[name]
@@ -69,104 +66,136 @@ def edited(flag, edit):
     return json.dumps(values)
 
 
+def with_value(flag, value, text=None):
+    return edited(flag, lambda inner, name: inner.__setitem__(name, value), text)
+
+
 def test_json_round_trip_keeps_every_flag():
-    config = Config(name="mine", seed=7, views=ViewsConfig(count=12, layout="ring"), model=ModelConfig(fusion=FusionConfig(image="views")))
-    config = changed(config, "data.noise_std", 0.0)
-    assert from_json(to_json(config)) == config
-    assert from_json(to_json(config)) != Config()
+    config = dataclasses.replace(PAPER, name="mine", seed=7, views=ViewsConfig(count=12, layout="ring"))
+    config = changed(changed(config, "model.fusion.image", "views"), "data.noise_std", 0.0)
+    config = changed(changed(config, "data.exclude", ("cup", "vase")), "compute.recompute", True)
+    assert config_from_json(to_json(config)) == config != PAPER
+    assert json.loads(to_json(config))["network"] == "cmignet"
 
 
-def test_sequences_come_back_as_tuples_so_that_configs_stay_hashable():
-    config = from_json(to_json(Config()))
+def test_sequences_come_back_as_tuples_so_that_configs_are_hashable():
+    config = config_from_json(to_json(PAPER))
     assert config.model.points.widths == (64, 64, 64, 128)
-    assert hash(config) == hash(Config())
+    assert hash(config) == hash(PAPER)
 
 
 @pytest.mark.parametrize(("flag", "value"), [(flag, value) for flag, values in REFUSED.items() for value in values])
 def test_a_refused_value_is_named_with_its_flag_and_what_was_expected(flag, value):
     with pytest.raises(ValueError, match=re.escape(f"{flag} = {value}") + ".*: expected .+"):
-        changed(Config(), flag, value)
+        changed(PAPER, flag, value)
 
 
-def test_every_rule_is_tested_above():
-    ruled = {name.split(" = ")[0] for name, _, _ in _rules(Config())}
+def test_every_rule_is_tested_above(monkeypatch):
+    ruled = set()
+    for module in (cmig_jax.config, cmignet):
+        monkeypatch.setattr(module, "check", lambda rules: ruled.update(name.split(" = ")[0] for name, _, _ in rules))
+    Config(name="paper", model=cmignet.CMIGNetFlags())
     assert ruled == set(REFUSED) | {"model.fusion.image"}
 
 
 def test_tied_image_fusion_needs_the_transformer_whose_weights_it_shares():
     with pytest.raises(ValueError, match=r"model\.fusion\.image = transformer with model\.fusion\.points = none"):
-        changed(Config(), "model.fusion", FusionConfig(points="none", image="transformer"))
+        changed(PAPER, "model.fusion", cmignet.FusionFlags(points="none", image="transformer"))
 
 
-def test_rules_bind_only_where_the_flag_is_used():
-    no_views = changed(changed(Config(), "loss.cross_modal", "off"), "model.fusion.image", "none")
+def test_rules_hold_only_where_the_flag_is_used():
+    no_views = changed(changed(PAPER, "model.loss.cross_modal", "off"), "model.fusion.image", "none")
     assert changed(no_views, "optim.batch", 1).optim.batch == 1
     assert changed(no_views, "model.image.widths", (8, 8, 8, 8)).model.points.dim == 512
-    everything = changed(Config(), "model.keypoints.select", "all")
-    assert changed(everything, "model.keypoints.count", 100_000).model.keypoints.select == "all"
-    assert changed(changed(Config(), "data.crop", "none"), "model.keypoints.count", 1024).data.crop == "none"
+    for layout, count in (("ring", 7), ("axes", 6), ("dodecahedron", 20)):
+        assert changed(PAPER, "views", ViewsConfig(layout=layout, count=count)).views.sets == 1
 
 
-@pytest.mark.parametrize(("flag", "value"), [("data.crop", "half"), ("model.matching.head", 3), ("loss.overlap", True), ("views.of", None)])
+def test_derived_numbers():
+    assert [data.cropped_points for data in (DataConfig(), DataConfig(crop="none"), DataConfig(points=10, keep=0.7))] == [768, 1024, 7]
+    assert [ViewsConfig(of=of).sets for of in ("object", "source", "target", "both")] == [1, 1, 1, 2]
+    assert [ComputeConfig(precision=precision).dtype for precision in ("float32", "bfloat16")] == [None, "bfloat16"]
+
+
+CHOICES = [("data.crop", "half"), ("model.matching.head", 3), ("model.loss.cross_modal", True), ("views.of", None)]
+
+
+@pytest.mark.parametrize(("flag", "value"), CHOICES)
 def test_a_value_outside_its_choices_is_named(flag, value):
-    text = edited(flag, lambda inner, name: inner.__setitem__(name, value))
     with pytest.raises(ValueError, match=re.escape(f"config.{flag} = {value!r}: expected one of ")):
-        from_json(text)
+        config_from_json(with_value(flag, value))
 
 
-@pytest.mark.parametrize(("flag", "value"), [("optim.batch", 6), ("data.exclude", ()), ("views.shown", "real"), ("views", ViewsConfig())])
-def test_a_flag_that_is_younger_than_the_file_has_its_default(flag, value):
-    config = from_json(edited(flag, lambda inner, name: inner.pop(name)))
-    assert config == Config()
-    for name in flag.split("."):
-        config = getattr(config, name)
-    assert config == value
+WRONG_TYPES = [("optim.batch", "six"), ("optim.batch", True), ("data.root", 5), ("data.exclude", "cup"), ("data.exclude", [3])]
+WRONG_TYPES += [("model.loss.margins", [1.0]), ("model.loss.overlap", "on"), ("compute.recompute", 1), ("name", None)]
+WRONG_TYPES += [("model", [1]), ("data", 5)]
 
 
-def test_the_defaults_of_younger_flags_are_what_was_done_before_them():
-    """`exclude` and `shown` are younger than the first trained networks: nothing was left out, and the pair's own views were shown."""
-    values = json.loads(to_json(changed(changed(Config(), "data.exclude", ("cup",)), "views.shown", "zero")))
-    del values["data"]["exclude"], values["views"]["shown"]
-    assert from_json(json.dumps(values)) == Config()
+@pytest.mark.parametrize(("flag", "value"), WRONG_TYPES)
+def test_a_value_of_the_wrong_type_is_named(flag, value):
+    with pytest.raises(ValueError, match=rf"^config\.{re.escape(flag)}(\[0\])? = .+: expected "):
+        config_from_json(with_value(flag, value))
 
 
-def test_names_come_back_as_a_tuple():
-    config = changed(Config(), "data.exclude", ("cup", "vase"))
-    assert from_json(to_json(config)) == config
-    with pytest.raises(ValueError, match=r"config\.data\.exclude = 'cup': expected a list of names"):
-        from_json(edited("data.exclude", lambda inner, name: inner.__setitem__(name, "cup")))
-    with pytest.raises(ValueError, match=r"config\.data\.exclude\[0\] = 3: expected str"):
-        from_json(edited("data.exclude", lambda inner, name: inner.__setitem__(name, [3])))
+@pytest.mark.parametrize("flag", ["optim.batch", "data.exclude", "views.shown", "views"])
+def test_a_flag_that_a_file_lacks_has_its_default(flag):
+    assert config_from_json(edited(flag, lambda inner, name: inner.pop(name))) == PAPER
 
 
-def test_unknown_flags_are_named():
+def test_unknown_and_missing_flags_and_networks_are_named():
     with pytest.raises(ValueError, match=r"config\.model\.points: unknown flags \['depth'\]"):
-        from_json(edited("model.points.depth", lambda inner, name: inner.__setitem__(name, 3)))
+        config_from_json(with_value("model.points.depth", 3))
+    with pytest.raises(ValueError, match=r"config: missing \['name'\]"):
+        config_from_json(edited("name", lambda inner, name: inner.pop(name)))
+    for network in ("pointer", None, ["cmignet"]):
+        with pytest.raises(ValueError, match=re.escape(f"config.network = {network!r}: expected one of cmignet")):
+            config_from_json(with_value("network", network))
 
 
-def test_what_is_no_config_is_refused():
-    with pytest.raises(ValueError, match="expected JSON"):
-        from_json("{")
-    with pytest.raises(ValueError, match="expected an object of flags"):
-        from_json("[]")
-    with pytest.raises(ValueError, match=r"config\.data = 5: expected an object of flags"):
-        from_json(edited("data", lambda inner, name: inner.__setitem__(name, 5)))
+def test_text_that_is_not_a_config_is_refused_and_rules_apply():
+    for text, message in (("{", "expected JSON"), ("[]", "expected an object of flags"), (with_value("data.keep", 2), r"data\.keep = 2")):
+        with pytest.raises(ValueError, match=message):
+            config_from_json(text)
 
 
-def test_reading_applies_the_rules():
-    with pytest.raises(ValueError, match=r"data\.keep = 2"):
-        from_json(edited("data.keep", lambda inner, name: inner.__setitem__(name, 2)))
+def test_the_layout_from_before_networks_had_names_is_read_as_the_same_settings():
+    model = cmignet.CMIGNetFlags(
+        points=cmignet.PointsFlags(k=16, widths=(32, 64), dim=128),
+        image=cmignet.ImageFlags(widths=(16, 128), blocks=(1, 1)),
+        fusion=cmignet.FusionFlags(image="views", feed_forward=256),
+        keypoints=cmignet.KeypointsFlags(count=64, test_count=384),
+        matching=cmignet.MatchingFlags(repeats=5, correspondence="soft", feature_widths=(64, 32)),
+        pose=cmignet.PoseFlags(centroid="unweighted"),
+        loss=cmignet.LossFlags(overlap=False, margins=(1.0, 3.0), cross_modal="nt-xent", match_mean="positive"),
+    )
+    data = DataConfig(source="shapes", points=512, sampling="twice", crop="independent", turn="either", exclude=("cup",))
+    views, compute = ViewsConfig(of="both", count=6, size=32, layout="axes"), ComputeConfig(recompute=True, rows=512)
+    optim = OptimConfig(learning_rate=2e-3, schedule="cosine", clip_norm=5.0)
+    assert config_from_json(OLD_LAYOUT) == Config(name="old", seed=3, model=model, data=data, views=views, optim=optim, compute=compute)
+    opposite = with_value("loss.overlap", "on", with_value("compute.recompute", "off", OLD_LAYOUT))
+    assert config_from_json(opposite).model.loss.overlap is True
+    assert config_from_json(opposite).compute.recompute is False
+    assert config_from_json('{"name": "paper"}') == PAPER
 
 
-@pytest.mark.parametrize(
-    ("flag", "value"), [("optim.batch", "six"), ("optim.batch", True), ("data.root", 5), ("loss.margins", [1.0]), ("name", None)]
-)
-def test_a_value_of_the_wrong_type_is_named(flag: str, value: object) -> None:
-    values = json.loads(to_json(Config()))
-    *groups, last = flag.split(".")
-    group = values
-    for name in groups:
-        group = group[name]
-    group[last] = value
-    with pytest.raises(ValueError, match=flag):
-        from_json(json.dumps(values))
+OLD_ERRORS = [("loss.overlap", "maybe"), ("compute.recompute", "yes"), ("loss", 5), ("compute", 5), ("model", 5)]
+
+
+@pytest.mark.parametrize(("flag", "value"), OLD_ERRORS)
+def test_errors_in_the_old_layout_are_named(flag, value):
+    with pytest.raises(ValueError, match=rf"^config\.(model\.)?{re.escape(flag)} = {value!r}: expected "):
+        config_from_json(with_value(flag, value, OLD_LAYOUT))
+
+
+def test_flags_by_dotted_name_and_differences():
+    other = changed(changed(PAPER, "model.points.k", 16), "data.exclude", ("cup",))
+    assert flat(other)["model.points.k"] == 16
+    assert differences(PAPER, PAPER) == []
+    assert sorted(differences(PAPER, other)) == ["data.exclude: () -> ('cup',)", "model.points.k: 20 -> 16"]
+
+
+def test_configs_and_flags_are_read_without_jax():
+    imports = "import sys, cmig_jax.config, cmig_jax.config_json, cmig_jax.models.cmignet.flags, configs, configs.catalogue"
+    check = "sys.exit(', '.join(sorted({'jax', 'jaxlib', 'flax'} & set(sys.modules))) or 0)"
+    found = subprocess.run([sys.executable, "-c", f"{imports}; {check}"], capture_output=True, text=True, check=False)
+    assert found.returncode == 0, found.stderr

@@ -1,8 +1,8 @@
-"""Registration without learning, to compare the network with (Sec. IV-A), every method with the settings it runs with.
+"""Registration without learning, to compare networks with (Sec. IV-A).
 
-`classical` lists the methods: `local` has those that need a start (ICP, generalised ICP; `finish` has them from the pose of a network),
-`fpfh` and `kiss` the global ones, which come with the extra `[baselines]`; `missing` says which are not there, and what brings them.
-Every method takes a source `[N, 3]` and a target `[M, 3]` and returns `target_from_source`: R `[3, 3]`, t `[3]`, float64.
+`classical` lists the methods. `local` has those that need a start (ICP, generalised ICP; `refine` starts them from a network's pose),
+`fpfh` and `kiss` have the global ones of the extra `[baselines]`. `missing` lists those that are not installed, and how to install them.
+Every method takes a source `[N, 3]` and a target `[M, 3]` and returns `target_from_source`, NumPy float64.
 """
 
 from __future__ import annotations
@@ -10,27 +10,18 @@ from __future__ import annotations
 from collections.abc import Callable
 from typing import Any
 
-from cmig_jax.baselines.finish import CUTOFFS, finish_by_gicp, finish_by_icp
 from cmig_jax.baselines.fpfh import FastGlobal, FpfhRansac, load_open3d
 from cmig_jax.baselines.kiss import KissMatcher, load_kiss_matcher
-from cmig_jax.baselines.local import (
-    ICP_CUTOFF,
-    ICP_TUNED,
-    Gicp,
-    Icp,
-    Identity,
-    gicp,
-    icp,
-    icp_cutoff,
-    icp_tuned,
-    identity,
-)
-from cmig_jax.baselines.method import Baseline, Pose
+from cmig_jax.baselines.local import ICP_CUTOFF, ICP_TUNED, Gicp, Icp, Identity, gicp, icp
+from cmig_jax.baselines.method import Baseline
+from cmig_jax.baselines.refine import CUTOFFS, refine_by_gicp, refine_by_icp
 from cmig_jax.config import DataConfig
-from cmig_jax.data.pairs import mean_angle_deg
+from cmig_jax.data.protocol import mean_angle_deg
 
 __all__ = [
     "CUTOFFS",
+    "ICP_CUTOFF",
+    "ICP_TUNED",
     "Baseline",
     "FastGlobal",
     "FpfhRansac",
@@ -38,26 +29,22 @@ __all__ = [
     "Icp",
     "Identity",
     "KissMatcher",
-    "Pose",
     "classical",
-    "finish_by_gicp",
-    "finish_by_icp",
     "gicp",
     "icp",
-    "icp_cutoff",
-    "icp_tuned",
-    "identity",
     "missing",
+    "refine_by_gicp",
+    "refine_by_icp",
 ]
 
-INSTALL = "pip install -e '.[baselines]'"
+INSTALL = "pip install 'cmig_jax[baselines]'"
 
 
 def classical(data: DataConfig) -> dict[str, Baseline]:
-    """Return the methods without learning by the name of their row: the core's, and those of the extra that can be imported.
+    """Return the methods without learning by the names of their rows; those of the extra only if it can be imported.
 
     Args:
-        data: the protocol, whose mean rotation the row "ICP (mean pose)" is told.
+        data: flags of the protocol; the row "ICP (mean pose)" starts from its mean rotation.
     """
     rows: dict[str, Baseline] = {
         "identity": Identity(),
@@ -71,7 +58,7 @@ def classical(data: DataConfig) -> dict[str, Baseline]:
 
 
 def missing() -> dict[str, str]:
-    """Return the rows that `classical` cannot make, each with the reason and the command that brings it."""
+    """Return the rows that `classical` leaves out, each with the reason and the command that installs its package."""
     reasons = {name: _obstacle(load) for name, (_, load) in _extra().items()}
     return {name: reason for name, reason in reasons.items() if reason is not None}
 
@@ -85,11 +72,11 @@ def _extra() -> dict[str, tuple[Baseline, Callable[[], Any]]]:
 
 
 def _obstacle(load: Callable[[], Any]) -> str | None:
-    """Say what keeps a package from being imported, or None."""
+    """Return the reason why a package cannot be imported, or None."""
     try:
         load()
     except ModuleNotFoundError as error:
         return f"{error}: {INSTALL}"
-    except (ImportError, OSError) as error:  # it is there, but a library of the system is not
+    except (ImportError, OSError) as error:  # the package is installed, but a system library that it needs is not
         return f"{error}: {INSTALL}, and install that library (libusb-1.0.so.0 is Debian's and Ubuntu's package libusb-1.0-0)"
     return None

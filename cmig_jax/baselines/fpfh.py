@@ -1,13 +1,13 @@
 """Global methods on FPFH features (Open3D, extra `[baselines]`): RANSAC, and Fast Global Registration.
 
-They need no start: the features of both clouds are matched, and a pose is sought that many matches agree with. Nothing tells them that
-rotations are small here, so where they are wrong they may be wrong by any angle, and RMSE(R) can exceed the identity's.
+They need no start: they match the features of both clouds and search for a pose that agrees with many matches. They do not use that
+rotations are small here: the error of a wrong pose may be any angle, so RMSE(R) can exceed that of the identity.
 
-Lengths are chosen on 100 training pairs each of generated objects (192 points) and real ones (384 points), sampled once and twice, noise
-0.01; the tables have RMSE(R) / MAE(R) / recall, with the finish. The other ratios are those of Open3D's tutorials.
+Lengths were chosen on 100 training pairs each of generated objects (192 points) and real ones (384 points), sampled once and twice,
+noise 0.01. The tables have RMSE(R) / MAE(R) / recall, with the refinement. The other ratios are those of Open3D's tutorials.
 
-One pair runs on one thread, from a fixed seed. Open3D's limit of threads and its random generator belong to the whole process: the
-limit is put back afterwards, the generator is not.
+Each pair runs on one thread, from a fixed seed. Open3D's limit of threads and its random generator belong to the whole process: the
+limit is restored afterwards, the state of the generator is not.
 """
 
 from __future__ import annotations
@@ -17,25 +17,55 @@ from collections.abc import Iterator
 from dataclasses import dataclass
 from typing import Any
 
-from numpy.typing import ArrayLike
+import numpy as np
 
-from cmig_jax.baselines.local import TUNED_ROUNDS, icp_rounds
-from cmig_jax.baselines.method import Floats, Pose, as_pose, checked_cloud, no_motion, recorded
+from cmig_jax.baselines.local import TUNED_ROUNDS, GlobalMethod
+from cmig_jax.baselines.method import Floats, recorded
+from cmig_jax.transform import RigidTransform, valid_transform
 
 
 def load_open3d() -> Any:
     """Import Open3D.
 
     Raises:
-        ImportError: it is not installed, or one of the system's libraries that it needs is not.
+        ImportError: it is not installed, or a system library that it needs is not.
     """
     import open3d  # pyright: ignore[reportMissingImports]
 
     return open3d
 
 
+class _OnFeatures(GlobalMethod):
+    """What the two methods share."""
+
+    length: float
+    normal_radius: float
+    normal_neighbours: int
+    feature_radius: float
+    feature_neighbours: int
+
+    @property
+    def settings(self) -> dict[str, Any]:
+        """The package with its version, fixed settings, and the fields."""
+        package = f"open3d {load_open3d().__version__}"
+        return recorded(self, package, start="none", thinning="none", normals="towards the centroid", threads=1)
+
+    def _features(self, open3d: Any, source: Floats, target: Floats) -> tuple[Any, Any, Any, Any]:
+        """Return both clouds with their normals, then the features of both."""
+        near = open3d.geometry.KDTreeSearchParamHybrid(self.normal_radius * self.length, self.normal_neighbours)
+        wide = open3d.geometry.KDTreeSearchParamHybrid(self.feature_radius * self.length, self.feature_neighbours)
+        clouds = []
+        for points in (source, target):
+            cloud = open3d.geometry.PointCloud(open3d.utility.Vector3dVector(points))
+            cloud.estimate_normals(near)
+            cloud.orient_normals_towards_camera_location(points.mean(axis=0))
+            clouds.append(cloud)
+        features = [open3d.pipelines.registration.compute_fpfh_feature(cloud, wide) for cloud in clouds]
+        return clouds[0], clouds[1], features[0], features[1]
+
+
 @dataclass(frozen=True)
-class FpfhRansac:
+class FpfhRansac(_OnFeatures):
     """FPFH features, RANSAC over their mutual matches, then ICP.
 
     ======  ==================  ==================  ==================  ==================
@@ -48,14 +78,15 @@ class FpfhRansac:
 
     Attributes:
         length: base length that the others are multiples of, in the clouds' unit.
-        normal_radius, feature_radius, max_distance: of a normal, of a feature, between points that agree; in base lengths.
-        normal_neighbours, feature_neighbours: at most this many points of each radius.
+        normal_radius, feature_radius: radii of the neighbourhoods of normals and features, in base lengths.
+        max_distance: largest distance of points that agree, in base lengths.
+        normal_neighbours, feature_neighbours: largest numbers of points within these radii.
         mutual: whether two points match only if each is the other's nearest.
         sample: matches per trial.
-        edge_similarity: least ratio of corresponding edges in a trial.
-        iterations, confidence: trials at most, and the probability at which they may end sooner.
-        seed: of the trials.
-        finish: rounds of ICP, as `Icp` has them.
+        edge_similarity: smallest ratio of corresponding edges in a trial.
+        iterations, confidence: largest number of trials, and the probability of success at which they stop.
+        seed: seed of the trials.
+        refinement: cutoffs of the rounds of ICP that follow.
     """
 
     length: float = 0.1
@@ -70,25 +101,15 @@ class FpfhRansac:
     iterations: int = 100_000
     confidence: float = 0.999
     seed: int = 0
-    finish: tuple[float | None, ...] = TUNED_ROUNDS
+    refinement: tuple[float | None, ...] = TUNED_ROUNDS
 
-    def register(self, source: ArrayLike, target: ArrayLike) -> Pose:
-        """Register one pair; where no pose is found, the finish starts from the identity."""
-        source, target = checked_cloud(source, "source"), checked_cloud(target, "target")
-        return icp_rounds(source, target, self.finish, self._search(source, target) or no_motion())
-
-    @property
-    def settings(self) -> dict[str, Any]:
-        """The package, what is fixed, and the fields."""
-        return _recorded(self)
-
-    def _search(self, source: Floats, target: Floats) -> Pose | None:
+    def _search(self, source: Floats, target: Floats) -> RigidTransform | None:
         open3d = load_open3d()
         registration = open3d.pipelines.registration
         reach = self.max_distance * self.length
         with _quiet_single_thread(open3d, self.seed):
             found = registration.registration_ransac_based_on_feature_matching(
-                *_features(open3d, self, source, target),
+                *self._features(open3d, source, target),
                 self.mutual,
                 reach,
                 registration.TransformationEstimationPointToPoint(False),
@@ -99,11 +120,11 @@ class FpfhRansac:
                 ],
                 registration.RANSACConvergenceCriteria(self.iterations, self.confidence),
             )
-        return as_pose(found.transformation) if found.fitness > 0 else None
+        return _pose_of(found) if found.fitness > 0 else None
 
 
 @dataclass(frozen=True)
-class FastGlobal:
+class FastGlobal(_OnFeatures):
     """FPFH features, Fast Global Registration, then ICP.
 
     ======  ==================  ==================  ==================  ==================
@@ -117,13 +138,14 @@ class FastGlobal:
 
     Attributes:
         length: base length that the others are multiples of, in the clouds' unit.
-        normal_radius, feature_radius, max_distance: of a normal, of a feature, between matches that agree; in base lengths.
-        normal_neighbours, feature_neighbours: at most this many points of each radius.
-        iterations: of the optimisation.
-        annealed, division_factor: whether the scale of the robust cost shrinks, down to `max_distance`, and by how much at a time.
-        tuple_scale, tuples: similarity of three matches' edges, and how many such threes at most.
-        seed: of the choice of threes.
-        finish: rounds of ICP, as `Icp` has them.
+        normal_radius, feature_radius: radii of the neighbourhoods of normals and features, in base lengths.
+        max_distance: smallest scale of the robust cost, in base lengths.
+        normal_neighbours, feature_neighbours: largest numbers of points within these radii.
+        iterations: iterations of the optimisation.
+        annealed, division_factor: whether the scale of the robust cost decreases, and the factor of each decrease.
+        tuple_scale, tuples: smallest similarity of the edges of three matches, and the largest number of such triples.
+        seed: seed of the choice of triples.
+        refinement: cutoffs of the rounds of ICP that follow.
     """
 
     length: float = 0.15
@@ -138,19 +160,9 @@ class FastGlobal:
     tuple_scale: float = 0.95
     tuples: int = 1000
     seed: int = 0
-    finish: tuple[float | None, ...] = TUNED_ROUNDS
+    refinement: tuple[float | None, ...] = TUNED_ROUNDS
 
-    def register(self, source: ArrayLike, target: ArrayLike) -> Pose:
-        """Register one pair; where no pose is found, the finish starts from the identity."""
-        source, target = checked_cloud(source, "source"), checked_cloud(target, "target")
-        return icp_rounds(source, target, self.finish, self._search(source, target) or no_motion())
-
-    @property
-    def settings(self) -> dict[str, Any]:
-        """The package, what is fixed, and the fields."""
-        return _recorded(self)
-
-    def _search(self, source: Floats, target: Floats) -> Pose | None:
+    def _search(self, source: Floats, target: Floats) -> RigidTransform | None:
         open3d = load_open3d()
         registration = open3d.pipelines.registration
         option = registration.FastGlobalRegistrationOption(
@@ -162,17 +174,17 @@ class FastGlobal:
             maximum_tuple_count=self.tuples,
         )
         with _quiet_single_thread(open3d, self.seed):
-            features = _features(open3d, self, source, target)
+            features = self._features(open3d, source, target)
             try:
                 found = registration.registration_fgr_based_on_feature_matching(*features, option)
-            except RuntimeError:  # it refuses clouds without extent
+            except RuntimeError:  # clouds without extent
                 return None
-        return as_pose(found.transformation)
+        return _pose_of(found)
 
 
 @contextlib.contextmanager
 def _quiet_single_thread(open3d: Any, seed: int) -> Iterator[None]:
-    """Run Open3D on one thread, whose random numbers alone are the same every time, and without its remarks on single pairs."""
+    """Run Open3D without its warnings and on one thread, since its random numbers can be repeated on one thread only."""
     threads = open3d.utility.get_max_threads()
     open3d.utility.set_max_threads(1)
     open3d.utility.random.seed(seed)
@@ -183,20 +195,6 @@ def _quiet_single_thread(open3d: Any, seed: int) -> Iterator[None]:
         open3d.utility.set_max_threads(threads)
 
 
-def _features(open3d: Any, method: FpfhRansac | FastGlobal, source: Floats, target: Floats) -> tuple[Any, Any, Any, Any]:
-    """Return both clouds with their normals, then the features of both."""
-    near = open3d.geometry.KDTreeSearchParamHybrid(method.normal_radius * method.length, method.normal_neighbours)
-    wide = open3d.geometry.KDTreeSearchParamHybrid(method.feature_radius * method.length, method.feature_neighbours)
-    clouds = []
-    for points in (source, target):
-        cloud = open3d.geometry.PointCloud(open3d.utility.Vector3dVector(points))
-        cloud.estimate_normals(near)
-        cloud.orient_normals_towards_camera_location(points.mean(axis=0))
-        clouds.append(cloud)
-    features = [open3d.pipelines.registration.compute_fpfh_feature(cloud, wide) for cloud in clouds]
-    return clouds[0], clouds[1], features[0], features[1]
-
-
-def _recorded(method: FpfhRansac | FastGlobal) -> dict[str, Any]:
-    package = f"open3d {load_open3d().__version__}"
-    return recorded(method, package, start="none", thinning="none", normals="towards the centroid", threads=1)
+def _pose_of(found: Any) -> RigidTransform | None:
+    T = np.asarray(found.transformation, np.float64)
+    return valid_transform(T[:3, :3], T[:3, 3])

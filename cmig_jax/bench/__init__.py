@@ -1,5 +1,5 @@
-"""Ours beside the PyTorch twin on the same machine: time by stage, compile time, peak memory (`python -m cmig_jax.bench`).
+"""Speed and memory of a network beside its PyTorch reference on the same machine (`cmig bench`).
 
-`cases` says what is measured, `ours` and `parity.twin_bench` do the same work, `worker` holds each in a process of its own, `clock` takes
-turns between them, `memory` is how much they held, `clouds` registers ever larger clouds.
+`cases` says what is measured; `ours` and the reference do the same work; `worker` holds each in its own process, `clock` takes turns
+between them, `run` measures time, memory, and larger and larger clouds with our network alone; `tables` prints.
 """

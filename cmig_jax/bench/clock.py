@@ -23,7 +23,7 @@ class Timing:
         return Timing({**self.medians, **other.medians}, max(self.spread, other.spread))
 
     def as_json(self) -> dict[str, float]:
-        """Name the numbers; `ratio` is PyTorch, as it is installed, over ours, and `ratio_kept` PyTorch with freed memory kept."""
+        """Name the numbers; `ratio` is PyTorch over ours, `ratio_kept` PyTorch that keeps its memory over ours."""
         ratios = {"ratio": PYTORCH, "ratio_kept": KEPT}
         known = {name: self.medians[who] / self.medians[OURS] for name, who in ratios.items() if {who, OURS} <= self.medians.keys()}
         return known | {f"{who}_s": seconds for who, seconds in self.medians.items()} | {"spread": self.spread}

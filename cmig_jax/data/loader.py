@@ -16,7 +16,7 @@ TRAINING_KEYS = ("source", "target", "R", "t", "views")
 
 
 class BatchIterator(Protocol):
-    """An endless iterator of batches that can say and take back where it stands."""
+    """An endless iterator of batches whose position can be saved and restored."""
 
     def __next__(self) -> Pair: ...
     def get_state(self) -> dict[str, Any]: ...
@@ -27,9 +27,9 @@ def training_batches(pairs: Pairs, config: Config, *, process: int = 0, processe
     """Iterate over shuffled batches of freshly drawn pairs, without end; the last incomplete batch of an epoch is dropped.
 
     Args:
-        pairs: the training objects and the protocol.
-        config: `optim.batch`, `seed`, `data.workers`.
-        process, processes: of several hosts, each makes its share of every batch.
+        pairs: pairs of the training objects.
+        config: `optim.batch`, `seed` and `data.workers` are used.
+        process, processes: index and number of processes, each of which makes its share of every batch.
 
     Returns:
         An iterator of dicts of arrays with a leading axis of `optim.batch / processes`.
@@ -49,18 +49,18 @@ def training_batches(pairs: Pairs, config: Config, *, process: int = 0, processe
     stream = data.to_iter_dataset(options)
     if config.data.workers:
         if not flags.FLAGS.is_parsed():
-            flags.FLAGS.mark_as_parsed()  # grain's workers read absl's flags, which no script of ours parses
+            flags.FLAGS.mark_as_parsed()  # grain's workers read absl's flags, which no script of this package parses
         stream = stream.mp_prefetch(grain.MultiprocessingOptions(num_workers=config.data.workers))
     return iter(stream)
 
 
 def epoch_steps(pairs: Pairs, config: Config) -> int:
-    """Return the steps of one epoch."""
+    """Return the number of steps in one epoch."""
     return len(pairs) // config.optim.batch
 
 
 def stack(pairs: Sequence[Pair]) -> Pair:
-    """Stack pairs of equal shapes into a batch `[B, ...]`, without what only evaluation reads."""
+    """Stack pairs of equal shapes into a batch `[B, ...]` of the arrays that training reads."""
     return {key: np.stack([pair[key] for pair in pairs]) for key in TRAINING_KEYS if key in pairs[0]}
 
 
@@ -69,7 +69,7 @@ def _with_seed(position: int, rng: np.random.Generator) -> tuple[int, int]:
 
 
 class _Draw:
-    """Draws this process's block of a batch; which pairs a batch holds does not depend on the number of processes."""
+    """Draws this process's part of a batch; the pairs of a whole batch do not depend on the number of processes."""
 
     def __init__(self, pairs: Pairs, process: int, processes: int) -> None:
         self.pairs, self.process, self.processes = pairs, process, processes

@@ -1,4 +1,4 @@
-"""Raw objects before preparation: what every reader returns, and the checks that all of them share."""
+"""Raw data before preparation: the declaration of a source, its objects or recordings, and the checks that all sources share."""
 
 from __future__ import annotations
 
@@ -10,19 +10,23 @@ from typing import Literal
 import numpy as np
 import trimesh
 
+from cmig_jax.clouds import check_cloud
+from cmig_jax.config import DataConfig
+
 Split = Literal["train", "test"]
 
 
 @dataclass(frozen=True)
 class RawObject:
-    """One object, whose geometry is read when it is asked for.
+    """One object; its geometry is read by `geometry`.
 
     Attributes:
-        name: unique enough to find the object again, such as its file.
+        name: unique in its split, for example its file; the seeds of the object's points and pairs depend on it.
         label: index into the categories of its dataset.
         split: "train" or "test".
         read: function without arguments that reads the geometry; it can be pickled.
-        shuffled: the points come in random order, so that any run of them is a fair sample (ModelNet40 HDF5).
+        shuffled: whether a cloud is stored in random order, so that its first points are a fair sample (ModelNet40 HDF5); others are
+            permuted.
     """
 
     name: str
@@ -38,19 +42,7 @@ class RawObject:
             ValueError: unreadable, no faces, no area, no points, or coordinates that are not finite; the message names the object.
         """
         value = self.read()
-        return check_mesh(value, self.name) if isinstance(value, trimesh.Trimesh) else check_points(value, self.name)
-
-    @property
-    def mesh(self) -> trimesh.Trimesh | None:
-        """The geometry where it is a mesh, else None; read at every access."""
-        value = self.geometry()
-        return value if isinstance(value, trimesh.Trimesh) else None
-
-    @property
-    def points(self) -> np.ndarray | None:
-        """The geometry where it is a cloud `[P, 3]` float64, else None; read at every access."""
-        value = self.geometry()
-        return None if isinstance(value, trimesh.Trimesh) else value
+        return check_mesh(value, self.name) if isinstance(value, trimesh.Trimesh) else check_cloud(value, self.name)
 
 
 @dataclass(frozen=True)
@@ -60,17 +52,15 @@ class RawDataset:
     Attributes:
         categories: names by label.
         objects: train objects first; opening a dataset reads names and labels only.
-        source: kind of data, as in `config.DataConfig.source`.
     """
 
     categories: tuple[str, ...]
     objects: Sequence[RawObject]
-    source: str
 
 
 @dataclass(frozen=True)
 class Recording:
-    """What a sensor saw from one place, in the frame of that place.
+    """A cloud that a sensor saw from one place, in the sensor's frame.
 
     Attributes:
         name: unique in its dataset.
@@ -87,26 +77,45 @@ class Recording:
 
 @dataclass(frozen=True)
 class RecordedDataset:
-    """The recordings of a source, to evaluate on.
+    """The recordings of a source.
 
     Attributes:
         categories: names by label: the scenes.
         recordings: opening a dataset reads names and poses only.
         candidates: positions (i, j), i < j, of recordings that may overlap.
-        source: kind of data, as in `config.DataConfig.source`.
     """
 
     categories: tuple[str, ...]
     recordings: Sequence[Recording]
     candidates: Sequence[tuple[int, int]]
-    source: str
+
+
+@dataclass(frozen=True)
+class Source:
+    """The declaration of a kind of data: all that the rest of the package knows of it.
+
+    Attributes:
+        name: value of `data.source`.
+        open: function that opens the data of these flags; it reads names and labels only.
+        records: whether it opens recordings with true poses, for evaluation only, instead of objects that the protocol makes pairs of.
+        trains: whether it has objects to train on.
+        folder: name of the download whose folder is `data.root`; several sources may share it. None if it needs no files.
+        flags: names of further flags of `DataConfig` that its objects depend on.
+    """
+
+    name: str
+    open: Callable[[DataConfig], RawDataset | RecordedDataset]
+    records: bool = False
+    trains: bool = True
+    folder: str | None = "data"
+    flags: tuple[str, ...] = ()
 
 
 def existing_folder(root: str | Path | None, expected: str) -> Path:
     """Return the folder of the raw data.
 
     Raises:
-        ValueError: none was named, or it is missing.
+        ValueError: `root` is None, or not a folder.
     """
     if root is None:
         raise ValueError(f"data.root = None: expected {expected}")
@@ -115,38 +124,23 @@ def existing_folder(root: str | Path | None, expected: str) -> Path:
     return Path(root)
 
 
+def visible_files(folder: Path, pattern: str) -> list[Path]:
+    """Return the files of a pattern by name, without hidden ones (macOS puts a `._name` beside a file)."""
+    return [path for path in sorted(folder.glob(pattern)) if path.is_file() and not path.name.startswith(".")]
+
+
 def check_mesh(mesh: trimesh.Trimesh, name: object) -> trimesh.Trimesh:
-    """Return a mesh that has a surface of finite corners.
+    """Return the mesh if it has a surface and finite coordinates.
 
     Raises:
-        ValueError: no faces, a face of a missing vertex, coordinates that are not finite, or no area.
+        ValueError: no faces, a face with a vertex that does not exist, coordinates that are not finite, or no area.
     """
     count = len(mesh.vertices)
     if len(mesh.faces) == 0:
         raise ValueError(f"{name}: 0 faces; expected a mesh with at least one")
     if mesh.faces.min() < 0 or mesh.faces.max() >= count:
         raise ValueError(f"{name}: a face of vertex {mesh.faces.max()}; expected 0 to {count - 1}")
-    if not np.isfinite(mesh.vertices).all():
-        raise ValueError(f"{name}: {_not_finite(mesh.vertices)}; expected finite coordinates")
+    check_cloud(mesh.vertices, name)
     if not mesh.area > 0:
         raise ValueError(f"{name}: surface area {mesh.area}; expected more than 0")
     return mesh
-
-
-def check_points(points: np.ndarray, name: object) -> np.ndarray:
-    """Return finite points `[P, 3]`, P >= 1, as float64: in geographic coordinates single precision has decimetres.
-
-    Raises:
-        ValueError: another shape or kind of numbers, or coordinates that are not finite.
-    """
-    points = np.asarray(points)
-    if points.ndim != 2 or points.shape[1] != 3 or len(points) == 0 or points.dtype.kind not in "fiu":
-        raise ValueError(f"{name}: points of shape {points.shape}, {points.dtype}; expected [P, 3] numbers with P >= 1")
-    if not np.isfinite(points).all():
-        raise ValueError(f"{name}: {_not_finite(points)}; expected finite coordinates")
-    return points.astype(np.float64)
-
-
-def _not_finite(points: np.ndarray) -> str:
-    row = int(np.flatnonzero(~np.isfinite(points).all(1))[0])
-    return f"point {row} is {points[row].tolist()}"

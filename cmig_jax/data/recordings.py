@@ -1,11 +1,10 @@
-"""Recordings on disk: what a sensor saw of a scene from several places, and which two of them overlap.
+"""Recordings on disk: clouds that a sensor saw of a scene from several places, and which two of them overlap.
 
-`stanford-scans`: the raw range scans that a `.conf` joins; any two of them may make a pair. `sevenscenes-fragments`: fragments of 50
-frames of the test scenes (Sec. IV-D); those that follow each other may. Two recordings are a pair, in either order, where at least the
-share `OVERLAP` of each has a point of the other closer than `NEAR` under the true pose.
+Two candidates of a source (`RecordedDataset.candidates`) are a pair, in either order, if at least the share `OVERLAP` of each has a
+point of the other closer than `NEAR` under the true pose.
 
-A prepared folder holds, beside a `<name>.npy` `[P, 3]` float32 of every recording in its sensor's frame and the units of the source,
-`pairs.json`: settings, categories, recordings with their poses, and pairs with their overlap. It is written last.
+A prepared folder holds a `<name>.npy` `[P, 3]` float32 of every recording, in its sensor's frame and the units of the source, and
+`pairs.json`: settings, categories, recordings with their poses, and pairs with their overlap. `pairs.json` is written last.
 """
 
 from __future__ import annotations
@@ -18,44 +17,27 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from scipy.spatial import KDTree
 from tqdm import tqdm
 
+from cmig_jax.clouds import check_cloud
 from cmig_jax.config import DataConfig
-from cmig_jax.data.raw import RecordedDataset, check_points
-from cmig_jax.data.sample import normalise_together
-from cmig_jax.data.sevenscenes import open_fragments
-from cmig_jax.data.shards import only_one, replacing
-from cmig_jax.data.stanford import open_scans
+from cmig_jax.data.overlap import overlap
+from cmig_jax.data.raw import RecordedDataset
+from cmig_jax.data.sample import normalise_pair
+from cmig_jax.data.shards import locked
+from cmig_jax.data.sources import open_recordings
+from cmig_jax.files import DAMAGED, remove_partial_files, replacing, write_text
 
-SOURCES = ("stanford-scans", "sevenscenes-fragments")
-"""The values of `data.source` that are recordings."""
 FORMAT = 1
 MANIFEST = "pairs.json"
 KEYS = {"settings", "categories", "recordings", "pairs"}
 OVERLAP = 0.3
 NEAR = 0.02
 """In units of the pair, whose larger cloud is scaled to the unit sphere: 2 mm for the Stanford bunny, 3.5 cm for a room."""
-_ASKED = 5000  # points of a cloud that are asked for their neighbour, evenly spaced: the share is exact to about 0.01
-
-
-def open_recordings(data: DataConfig) -> RecordedDataset:
-    """Open the recordings that the flags name; names and poses are read now, clouds when they are asked for.
-
-    Raises:
-        ValueError: another source, a missing folder or file, or one that is not as the source expects; the message names it.
-    """
-    match data.source:
-        case "stanford-scans":
-            return open_scans(data.root)
-        case "sevenscenes-fragments":
-            return open_fragments(data.root)
-        case _:
-            raise ValueError(f"data.source = {data.source}: expected {' or '.join(SOURCES)}")
 
 
 def ensure_recordings(data: DataConfig, *, progress: bool = True) -> Path:
-    """Return the prepared folder of recordings; prepare it first, or to its end, if it has no manifest.
+    """Return the prepared folder of recordings; prepare it first, or complete it, if it has no manifest.
 
     Args:
         data: `source`, `root`, `prepared`.
@@ -70,8 +52,9 @@ def ensure_recordings(data: DataConfig, *, progress: bool = True) -> Path:
     if not (folder / MANIFEST).exists():
         recorded = open_recordings(data)
         folder.mkdir(parents=True, exist_ok=True)
-        with only_one(folder):
-            _prepare(recorded, settings, folder, progress)
+        with locked(folder):
+            if not (folder / MANIFEST).exists():  # no other process has made it in the meantime
+                _prepare(recorded, settings, folder, progress)
     if (made := read_manifest(folder)["settings"]["data.source"]) != data.source:
         raise ValueError(
             f"data.source = {data.source}, but {folder} was prepared with data.source = {made}: "
@@ -90,7 +73,7 @@ def read_manifest(folder: Path) -> dict[str, Any]:
     try:
         manifest = json.loads(path.read_text())
     except (OSError, ValueError) as error:
-        raise ValueError(f"{path}: not readable ({error}); delete it, and it is made anew") from error
+        raise ValueError(f"{path}: not readable ({error}); delete it, and the next run prepares the folder again") from error
     if not isinstance(manifest, dict) or manifest.get("format") != FORMAT or not manifest.keys() >= KEYS:
         raise ValueError(f"{path}: expected a manifest of format {FORMAT}; name another folder (data.prepared)")
     return manifest
@@ -103,13 +86,14 @@ def read_recording(folder: Path, file: str) -> np.ndarray:
         ValueError: missing or damaged.
     """
     try:
-        return check_points(np.load(folder / file), folder / file)
-    except (OSError, EOFError, ValueError) as error:
-        raise ValueError(f"{folder / file}: not readable ({error}); delete it and {folder / MANIFEST}, and both are made anew") from error
+        return check_cloud(np.load(folder / file), folder / file)
+    except DAMAGED as error:
+        repair = f"delete it and {folder / MANIFEST}, and the next run makes both again"
+        raise ValueError(f"{folder / file}: not readable ({error}); {repair}") from error
 
 
-def between(world_from_source: np.ndarray, world_from_target: np.ndarray) -> np.ndarray:
-    """Return target_from_source `[4, 4]` of two rigid `[4, 4]`, its rotation exact.
+def between(world_from_source: np.ndarray, world_from_target: np.ndarray, name: str = "pair") -> np.ndarray:
+    """Return target_from_source `[4, 4]` of two poses `[4, 4]`, with its rotation made orthonormal; `name` is that of the pair in an error.
 
     Raises:
         ValueError: the result is not rigid.
@@ -117,40 +101,25 @@ def between(world_from_source: np.ndarray, world_from_target: np.ndarray) -> np.
     target_from_source = np.linalg.inv(world_from_target) @ world_from_source
     u, stretch, vh = np.linalg.svd(target_from_source[:3, :3])
     if np.abs(stretch - 1).max() > 1e-2 or np.linalg.det(u @ vh) < 0:
-        raise ValueError(f"target_from_source = {target_from_source.tolist()}: expected a rotation and a translation")
+        raise ValueError(f"{name}: target_from_source = {target_from_source.tolist()}: expected a rotation and a translation")
     target_from_source[:3, :3] = u @ vh
     return target_from_source
 
 
-def overlap(source: np.ndarray, target: np.ndarray, target_from_source: np.ndarray) -> float:
-    """Return the smaller of the two shares of a cloud whose points have one of the other cloud nearer than `NEAR`.
-
-    Args:
-        source: `[N, 3]`, any unit.
-        target: `[M, 3]`, the same unit.
-        target_from_source: `[4, 4]`, the true transform, in that unit.
-    """
-    near = NEAR * normalise_together(source, target)[-1]
-    moved = source @ target_from_source[:3, :3].T + target_from_source[:3, 3]
-    shares = []
-    for one, other in ((moved, target), (target, moved)):
-        distance, _ = KDTree(other, balanced_tree=False).query(one[:: 1 + len(one) // _ASKED], distance_upper_bound=near)
-        shares.append(np.mean(distance < near))
-    return float(min(shares))
-
-
 def _prepare(recorded: RecordedDataset, settings: dict[str, Any], folder: Path, progress: bool) -> None:
-    """Write the clouds that are not there yet, then the manifest."""
+    """Write the clouds that are missing, then the manifest; remove the temporary files of processes that were killed."""
     files = [_file_name(recording.name) for recording in recorded.recordings]
     for recording, file in zip(tqdm(recorded.recordings, f"prepare {folder}", unit="cloud", disable=not progress), files, strict=True):
         if not (folder / file).exists():
-            cloud = check_points(recording.read(), recording.name)
+            cloud = check_cloud(recording.read(), recording.name)
             with replacing(folder / file) as opened:
                 np.save(opened, cloud.astype(np.float32))
     poses = [recording.world_from_sensor for recording in recorded.recordings]
     pairs = []
     for i, j in tqdm(recorded.candidates, "overlaps", unit="pair", disable=not progress):
-        share = overlap(read_recording(folder, files[i]), read_recording(folder, files[j]), between(poses[i], poses[j]))
+        pose = between(poses[i], poses[j], f"{recorded.recordings[i].name} to {recorded.recordings[j].name}")
+        clouds = read_recording(folder, files[i]), read_recording(folder, files[j])
+        share = overlap(*clouds, pose[:3, :3], pose[:3, 3], NEAR * normalise_pair(*clouds).scale)
         pairs += [[i, j, share], [j, i, share]] if share >= OVERLAP else []
     if not pairs:
         raise ValueError(
@@ -167,8 +136,8 @@ def _prepare(recorded: RecordedDataset, settings: dict[str, Any], folder: Path, 
         ],
         "pairs": pairs,
     }
-    with replacing(folder / MANIFEST) as opened:
-        opened.write(json.dumps(manifest, indent=1).encode())
+    write_text(folder / MANIFEST, json.dumps(manifest, indent=1))
+    remove_partial_files(folder)
 
 
 def _file_name(name: str) -> str:

@@ -4,41 +4,35 @@ Cameras stand around the unit sphere and look at its centre. The projection is o
 view is 8 bits, `[H, W]`: 0 is background, 255 the nearest depth the unit ball can have, 1 the farthest, linear in between.
 
 The z-buffer is three array operations per view: points are written in order of depth, so the nearest stays; every point is grown to a
-disc by a running maximum (the greatest grey is the nearest, so this is a z-buffer of discs); and the discs are trimmed back by a running
-minimum, which leaves the gaps between points closed but the silhouette and the depth close to the true ones.
-
-`python -m cmig_jax.data.render --benchmark` prints objects per second per core.
+disc by a running maximum (the largest grey is the nearest depth, so this is a z-buffer of discs); and a running minimum shrinks the
+result, which keeps the gaps between points closed and the silhouette and the depth close to the true ones.
 """
 
 from __future__ import annotations
 
-import argparse
 import functools
 import math
-import time
-from typing import Literal
 
 import numpy as np
 from scipy.spatial import KDTree
 
-Layout = Literal["dodecahedron", "ring", "axes"]
+from cmig_jax.clouds import check_cloud
+from cmig_jax.config import Layout
+from cmig_jax.data.sample import centre
 
 EXTENT = 1.04
 """Half the width of the image plane: the unit ball and a margin for the splats."""
 RING_ELEVATION = math.radians(30.0)
 
 
-def render_views(
-    points: np.ndarray, *, layout: Layout = "dodecahedron", count: int = 20, size: int = 224, splat: int | None = None, fit: bool = False
-) -> np.ndarray:
+def render_views(points: np.ndarray, *, layout: Layout = "dodecahedron", count: int = 20, size: int = 224, fit: bool = False) -> np.ndarray:
     """Render the depth of a point cloud from every camera of a layout.
 
     Args:
         points: `[P, 3]`, an object in the unit sphere; with `fit`, a cloud in any frame and at any scale.
-        layout: where the cameras stand; see `camera_directions`.
+        layout: positions of the cameras; see `camera_directions`.
         count: number of views V.
         size: height and width of a view, pixels.
-        splat: radius of the disc that stands for a point, pixels; by default from the density of points (see `splat_radius`).
         fit: move the mean of the cloud to the origin and scale its largest radius to 1 first.
 
     Returns:
@@ -50,9 +44,7 @@ def render_views(
     points = _checked(points, fit)
     if size < 8:
         raise ValueError(f"size = {size}: expected at least 8 pixels")
-    radius = splat_radius(points, size) if splat is None else splat
-    if radius < 0:
-        raise ValueError(f"splat = {radius}: expected 0 pixels or more")
+    radius = splat_radius(points, size)
     frames = camera_frames(layout, count)
     inside = slice(radius, radius + size)  # a border of background, so that the discs of one row or view never reach the next
     canvas = np.zeros((len(frames), size + 2 * radius, size + 2 * radius), np.uint8)
@@ -135,20 +127,12 @@ def splat_radius(points: np.ndarray, size: int) -> int:
 
 def _checked(points: np.ndarray, fit: bool) -> np.ndarray:
     """Return `[P, 3]` float32 in the unit sphere."""
-    points = np.asarray(points)
-    if points.ndim != 2 or points.shape[1] != 3 or len(points) == 0:
-        raise ValueError(f"points of shape {points.shape}: expected [P, 3] with at least one point")
-    if points.dtype.kind not in "fiu":
-        raise ValueError(f"points of dtype {points.dtype}: expected real numbers")
-    bad = len(points) - int(np.isfinite(points).all(axis=1).sum())
-    if bad:
-        raise ValueError(f"{bad} of {len(points)} points: expected finite coordinates, not NaN or infinity")
+    points = check_cloud(points)
     if fit:
-        points = points - points.mean(axis=0, dtype=np.float64)
-    farthest = math.sqrt(float(np.max(np.einsum("pi,pi->p", points, points, dtype=np.float64))))
-    if fit and farthest > 0:
-        points = points / farthest
-    elif farthest > 1.001:
+        centred, _, radius = centre(points)
+        return (centred / radius if radius > 0 else np.zeros_like(centred)).astype(np.float32)
+    farthest = math.sqrt(float(np.max(np.einsum("pi,pi->p", points, points))))
+    if farthest > 1.001:
         raise ValueError(f"a point at radius {farthest:.4g}: expected an object in the unit sphere, or fit=True")
     return points.astype(np.float32)
 
@@ -180,18 +164,15 @@ def _disc_extremum(extremum: np.ufunc, images: np.ndarray, radius: int) -> np.nd
     stride = images.shape[-1]
     spans = [images.ravel()]  # spans[w]: extremum over the columns -w to w
     for width in range(1, radius + 1):
-        spans.append(_with_neighbours(extremum, spans[-1], spans[0], width))
+        spans.append(_extended(extremum, spans[-1].copy(), spans[0], width))
     result = spans[radius].copy()
     for rise in range(1, radius + 1):
-        span = spans[int(math.sqrt((radius + 0.5) ** 2 - rise**2))]
-        extremum(result[rise * stride :], span[: -rise * stride], out=result[rise * stride :])
-        extremum(result[: -rise * stride], span[rise * stride :], out=result[: -rise * stride])
+        _extended(extremum, result, spans[int(math.sqrt((radius + 0.5) ** 2 - rise**2))], rise * stride)
     return result.reshape(images.shape)
 
 
-def _with_neighbours(extremum: np.ufunc, first: np.ndarray, image: np.ndarray, offset: int) -> np.ndarray:
-    """Return the extremum of `first [L]` and of `image [L]` shifted by `offset` to either side."""
-    result = first.copy()
+def _extended(extremum: np.ufunc, result: np.ndarray, image: np.ndarray, offset: int) -> np.ndarray:
+    """Take the extremum of `result [L]` and of `image [L]` shifted by `offset` to either side, in place, and return it."""
     extremum(result[offset:], image[:-offset], out=result[offset:])
     extremum(result[:-offset], image[offset:], out=result[:-offset])
     return result
@@ -211,38 +192,3 @@ def _dodecahedron() -> np.ndarray:
     cube = [[x, y, z] for x in (1.0, -1.0) for y in (1.0, -1.0) for z in (1.0, -1.0)]
     edge = np.concatenate([np.zeros((4, 1)), signs * [1 / golden, golden]], axis=1)
     return np.concatenate([cube, edge, np.roll(edge, 2, axis=1), np.roll(edge, 1, axis=1)])
-
-
-def _benchmark(seconds: float = 3.0) -> None:
-    """Print the speed of one core (processor time, so that threads of a linear algebra library do not count as speed)."""
-    rng = np.random.default_rng(0)
-    cases: list[tuple[Layout, int, int, int]] = [
-        ("dodecahedron", 20, 224, 16384),
-        ("ring", 12, 224, 16384),
-        ("axes", 6, 224, 16384),
-        ("dodecahedron", 20, 64, 2048),
-        ("dodecahedron", 20, 32, 768),
-        ("axes", 6, 64, 768),
-        ("axes", 6, 32, 768),
-        ("axes", 6, 24, 768),
-    ]
-    for layout, count, size, number in cases:
-        points = rng.normal(size=(number, 3))
-        points /= np.linalg.norm(points, axis=1, keepdims=True)
-        render_views(points, layout=layout, count=count, size=size)
-        start, repeats = time.process_time(), 0
-        while time.process_time() - start < seconds:
-            render_views(points, layout=layout, count=count, size=size)
-            repeats += 1
-        each = (time.process_time() - start) / repeats
-        print(
-            f"{layout:>12} {count:2} views {size:3} px {number:5} points, splat {splat_radius(points, size)} px: "
-            f"{1 / each:7.1f} objects/s/core, {1e3 * each:7.2f} ms per object, {1e3 * each / count:6.3f} ms per view"
-        )
-
-
-if __name__ == "__main__":
-    parser = argparse.ArgumentParser(prog="python -m cmig_jax.data.render", description="Depth projections of point clouds.")
-    parser.add_argument("--benchmark", action="store_true", required=True, help="print objects per second per core")
-    parser.parse_args()
-    _benchmark()

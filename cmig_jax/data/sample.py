@@ -1,40 +1,18 @@
-"""Points of an object: uniform sampling of a surface, and the scale of the unit sphere (Sec. IV-B)."""
+"""Points of an object: uniform sampling of a surface, and normalisation to the unit sphere (Sec. IV-B)."""
 
 from __future__ import annotations
 
+from dataclasses import dataclass
+
 import numpy as np
 import trimesh
+from numpy.typing import NDArray
 
-from cmig_jax.data.raw import RawObject, check_mesh, check_points
+from cmig_jax.clouds import check_cloud
+from cmig_jax.data.raw import check_mesh
 
-
-def object_points(item: RawObject, count: int, rng: np.random.Generator) -> np.ndarray:
-    """Return normalised points of an object.
-
-    A mesh is sampled. A cloud in random order (ModelNet40 HDF5) gives its first `count` points as they come, so that its first and last
-    1,024 are two independent samplings of 2,048; any other cloud gives a random subset without replacement. A cloud is normalised
-    whole, before the choice.
-
-    Args:
-        item: the object.
-        count: number of points P.
-        rng: source of randomness.
-
-    Returns:
-        `[P, 3]` float32 in the unit sphere.
-
-    Raises:
-        ValueError: bad geometry, or a cloud of fewer than `count` points; the message names the object.
-    """
-    geometry = item.geometry()
-    if isinstance(geometry, trimesh.Trimesh):
-        return normalise(sample_surface(geometry, count, rng), item.name)[0]
-    if len(geometry) < count:
-        raise ValueError(f"{item.name}: {len(geometry)} points; expected at least {count}")
-    points = normalise(geometry, item.name)[0]
-    if item.shuffled or len(points) == count:
-        return points[:count]
-    return points[rng.choice(len(points), count, replace=False)]
+RESOLUTION = float(np.finfo(np.float64).eps / np.finfo(np.float32).eps)
+"""Smallest radius of a cloud, relative to its coordinates, at which float64 coordinates still give normalised float32 ones."""
 
 
 def sample_surface(mesh: trimesh.Trimesh, count: int, rng: np.random.Generator) -> np.ndarray:
@@ -43,7 +21,7 @@ def sample_surface(mesh: trimesh.Trimesh, count: int, rng: np.random.Generator) 
     Args:
         mesh: triangles.
         count: number of points P, at least 1.
-        rng: source of randomness; the points are a function of the mesh and its state.
+        rng: random generator; the points are a function of the mesh and of this generator's state.
 
     Returns:
         `[P, 3]` float32 in the units of the mesh, in random order.
@@ -64,46 +42,80 @@ def sample_surface(mesh: trimesh.Trimesh, count: int, rng: np.random.Generator) 
     return (corners[face, 0] + np.einsum("pe,pec->pc", weight, edges[face])).astype(np.float32)
 
 
-def normalise(points: np.ndarray, name: object = "points") -> tuple[np.ndarray, np.ndarray, float]:
+def centre(points: NDArray[np.float64]) -> tuple[NDArray[np.float64], NDArray[np.float64], float]:
+    """Move points `[P, 3]` so that their mean is the origin.
+
+    Returns:
+        The moved points `[P, 3]`, their mean `[3]`, and their largest norm; 0 if the points are equal up to rounding.
+    """
+    mean = points.mean(0)
+    centred = points - mean
+    radius = float(np.linalg.norm(centred, axis=-1).max())
+    return centred, mean, radius if radius > RESOLUTION * np.abs(points).max() else 0.0
+
+
+def normalise(points: np.ndarray, name: object = "points") -> np.ndarray:
     """Centre points at their mean and scale them so that the farthest lies on the unit sphere, as ModelNet40 HDF5 does.
 
     Args:
         points: `[P, 3]`, any unit.
-        name: what an error calls them.
+        name: name of the points in an error.
 
     Returns:
-        Points `[P, 3]` float32 of largest norm 1; centre `[3]` float64 and scale, with `points = normalised * scale + centre`.
+        `[P, 3]` float32 of largest norm 1.
 
     Raises:
         ValueError: a wrong shape, coordinates that are not finite, or all points equal.
     """
-    check_points(points, name)
-    exact = np.asarray(points, np.float64)
-    centre = exact.mean(0)
-    scale = float(np.linalg.norm(exact - centre, axis=-1).max())
-    if not scale > np.finfo(np.float32).eps * np.abs(exact).max():
+    exact = check_cloud(points, name)
+    centred, _, scale = centre(exact)
+    if scale == 0:
         raise ValueError(f"{name}: all {len(exact)} points equal {exact[0].tolist()}; expected points apart")
-    return ((exact - centre) / scale).astype(np.float32), centre, scale
+    return (centred / scale).astype(np.float32)
 
 
-def normalise_together(source: np.ndarray, target: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray, float]:
-    """Centre two clouds, each at its own mean, and scale both by one factor so that the farthest point lies on the unit sphere.
+@dataclass(frozen=True)
+class NormalisedPair:
+    """Two clouds, each centred at its own mean, both scaled by one factor so that the farthest point lies on the unit sphere.
 
-    Only what each cloud shows is used, so nothing about the transform between them is given away.
+    Centres and scale come from the clouds alone, so they reveal nothing about the transform between them.
+
+    Attributes:
+        source, target: `[N, 3]`, `[M, 3]` float64, normalised.
+        source_centre, target_centre: `[3]`, in the original unit.
+        scale: original cloud = normalised cloud * scale + centre.
+    """
+
+    source: NDArray[np.float64]
+    target: NDArray[np.float64]
+    source_centre: NDArray[np.float64]
+    target_centre: NDArray[np.float64]
+    scale: float
+
+    def normalised_translation(self, R: np.ndarray, t: np.ndarray) -> np.ndarray:
+        """Return the translation between the normalised clouds, given R and t of target_from_source between the original ones."""
+        return (R @ self.source_centre + t - self.target_centre) / self.scale
+
+    def original_translation(self, R: np.ndarray, t: np.ndarray) -> np.ndarray:
+        """Undo `normalised_translation`."""
+        return self.target_centre + self.scale * t - R @ self.source_centre
+
+
+def normalise_pair(source: np.ndarray, target: np.ndarray) -> NormalisedPair:
+    """Normalise two clouds of one unit together.
 
     Args:
-        source: `[N, 3]`, any unit.
-        target: `[M, 3]`, the same unit.
-
-    Returns:
-        Both clouds, `[N, 3]` and `[M, 3]` float64; their centres, `[3]` each; the scale. `cloud = normalised * scale + centre`.
+        source: `[N, 3]`.
+        target: `[M, 3]`.
 
     Raises:
-        ValueError: a wrong shape, coordinates that are not finite, or all points of both clouds equal to the centres.
+        ValueError: a wrong shape, coordinates that are not finite, or all points of both clouds equal to their centres.
     """
-    x, y = (np.asarray(check_points(cloud, name), np.float64) for cloud, name in ((source, "source"), (target, "target")))
-    centre_x, centre_y = x.mean(0), y.mean(0)
-    scale = float(max(np.linalg.norm(x - centre_x, axis=-1).max(), np.linalg.norm(y - centre_y, axis=-1).max()))
-    if not scale > 0:
-        raise ValueError(f"source and target: all points equal {centre_x.tolist()} and {centre_y.tolist()}; expected points apart")
-    return (x - centre_x) / scale, (y - centre_y) / scale, centre_x, centre_y, scale
+    x, y = check_cloud(source, "source"), check_cloud(target, "target")
+    (x, source_centre, source_radius), (y, target_centre, target_radius) = centre(x), centre(y)
+    scale = max(source_radius, target_radius)
+    if scale == 0:
+        raise ValueError(
+            f"source and target: all points equal {source_centre.tolist()} and {target_centre.tolist()}; expected points apart"
+        )
+    return NormalisedPair(x / scale, y / scale, source_centre, target_centre, scale)

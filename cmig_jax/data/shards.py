@@ -2,36 +2,39 @@
 
 A prepared folder holds `manifest.json` and, per shard of n objects, two memory-mappable arrays:
 
-    <split>-00000.points.npy   [n, P, 3] float32, points on the surface, in the unit sphere
+    <split>-00000.points.npy   [n, P, 3] float32, points on the surface, in the unit sphere; a smaller cloud repeats its points
     <split>-00000.views.npy    [n, V, H, W] uint8, depth views (Sec. III-A); only where `views.of` is `object`
 
-The manifest has every setting that the arrays depend on, the categories, and per split the shards with labels, names and, per file,
-size and SHA-256. It is written last, so a folder with a manifest was prepared to its end.
+The manifest has every setting that the arrays depend on, the categories, and per split the shards with names, labels and numbers of
+distinct points of their objects and, per file, size and SHA-256. It is written last, so a folder with a manifest is complete.
 """
 
 from __future__ import annotations
 
 import contextlib
-import fcntl
 import hashlib
 import json
-import os
 import shlex
 from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
-from typing import Any, BinaryIO, Literal
+from typing import Any, Literal
 
 import numpy as np
+from filelock import FileLock
 
-from cmig_jax.config import Config
+from cmig_jax.config import DataConfig, ViewsConfig
+from cmig_jax.data.sources import source_of
+from cmig_jax.files import DAMAGED, remove_partial_files, write_text
 
-FORMAT = 1
+FORMAT = 2
 MANIFEST = "manifest.json"
+LOCK = ".lock"
+NOTES = "*-[0-9][0-9][0-9][0-9][0-9].json"
 KEYS = {"settings", "categories", "distinct", "splits"}
 
 
 class Shards:
-    """One split of a prepared folder; arrays are mapped on first use, in each process anew.
+    """One split of a prepared folder; every process maps an array when it first reads it.
 
     Args:
         folder: a prepared folder.
@@ -44,7 +47,8 @@ class Shards:
         categories: names of the categories.
 
     Raises:
-        ValueError: no manifest, an unknown split, or a shard that is missing, truncated or changed; the message has the repairing command.
+        ValueError: no manifest, an unknown split, or a shard that is missing, truncated or changed; the message has the command that
+            repairs it.
     """
 
     def __init__(self, folder: str | Path, split: str, *, verify: Literal["size", "checksum"] = "size") -> None:
@@ -59,6 +63,7 @@ class Shards:
         self.categories: tuple[str, ...] = tuple(self._manifest["categories"])
         self.labels = np.array([label for shard in self._shards for label in shard["labels"]], np.int64)
         self.names: tuple[str, ...] = tuple(name for shard in self._shards for name in shard["names"])
+        self._distinct: list[int] = [number for shard in self._shards for number in shard["distinct"]]
         self._starts = np.cumsum([0] + [len(shard["labels"]) for shard in self._shards])
         self._mapped: dict[str, np.ndarray] = {}
 
@@ -66,10 +71,10 @@ class Shards:
         return len(self.names)
 
     def points(self, i: int) -> np.ndarray:
-        """Return the points of object i: `[P, 3]` float32, read only."""
+        """Return the points of object i without repetitions: `[P, 3]` float32, read only."""
         found = self._row(i, "points")
         assert found is not None
-        return found
+        return found[: self._distinct[i]]
 
     def views(self, i: int) -> np.ndarray | None:
         """Return the depth views of object i: `[V, H, W]` uint8, read only; None where observed clouds are rendered instead."""
@@ -88,7 +93,7 @@ class Shards:
         if file["name"] not in self._mapped:
             try:
                 mapped = np.load(self.folder / file["name"], mmap_mode="r")
-            except (OSError, ValueError) as error:
+            except DAMAGED as error:
                 raise ValueError(self._with_repair(f"{self.folder / file['name']} cannot be read ({error})")) from error
             self._mapped[file["name"]] = np.asarray(mapped)
         return self._mapped[file["name"]][i - self._starts[number]]
@@ -97,40 +102,38 @@ class Shards:
         return f"{fault}; repair it with: {repair_command(self._manifest['settings'], self.folder)}"
 
 
-def settings_of(config: Config) -> dict[str, Any]:
-    """Return the settings that prepared arrays depend on, named like their flags.
+def settings_of(data: DataConfig, views: ViewsConfig) -> dict[str, Any]:
+    """Return the settings that prepared arrays depend on, by the names of their flags.
 
-    Up to 1,024 points are always prepared, so that smaller `data.points` share a folder. Flags that do not matter are left out.
+    At least 1,024 points are prepared, so that all smaller values of `data.points` share a folder.
     """
-    data, views = config.data, config.views
     settings: dict[str, Any] = {"data.source": data.source, "data.points": max(1024, data.points)}
     if data.root is not None:
         settings["data.root"] = str(Path(data.root).expanduser().resolve())
-    if data.source == "shapes":
-        settings["data.shapes"] = data.shapes
+    settings |= {f"data.{flag}": getattr(data, flag) for flag in source_of(data).flags}
     if views.of == "object":
         settings |= {"views.of": views.of, "views.count": views.count, "views.size": views.size, "views.layout": views.layout}
     else:
-        settings["views.of"] = "source"  # observed clouds are rendered in training: nothing is stored
+        settings["views.of"] = "source"  # for all views of observed clouds, which are rendered with the pair and not stored
     return settings
 
 
-def check_settings(folder: Path, config: Config) -> None:
-    """Refuse a prepared folder that was made with other settings than a config's.
+def check_settings(folder: Path, data: DataConfig, views: ViewsConfig) -> None:
+    """Check that a prepared folder was made with the settings of these flags.
 
-    More points than the config needs are fine, views that it does not need are fine, and so is another place of the raw data.
+    More points than needed, views that are not needed, and another folder of raw data are accepted.
 
     Raises:
-        ValueError: naming the flag, its value in the folder, and its value in the config.
+        ValueError: naming the flag, its value in the folder, and its value in the flags.
     """
     manifest = read_manifest(folder)
-    made, wanted = manifest["settings"], settings_of(config)
-    per_object = config.data.points * (2 if config.data.sampling == "twice" else 1)
+    made, wanted = manifest["settings"], settings_of(data, views)
+    per_object = data.points * (2 if data.sampling == "twice" else 1)
     if manifest["distinct"] < per_object:
-        detail = f"data.points = {config.data.points} with data.sampling = {config.data.sampling}"
+        detail = f"data.points = {data.points} with data.sampling = {data.sampling}"
         raise ValueError(f"{detail} needs {per_object} points of every object, but {folder} has objects of {manifest['distinct']}")
-    names = ["data.source", "data.shapes"]
-    if config.views.of == "object":
+    names = ["data.source", *(f"data.{flag}" for flag in source_of(data).flags)]
+    if views.of == "object":
         names += ["views.of", "views.count", "views.size", "views.layout"]
     for name in names:
         if made.get(name) != wanted.get(name):
@@ -143,7 +146,7 @@ def check_settings(folder: Path, config: Config) -> None:
 def repair_command(settings: Mapping[str, Any], folder: Path) -> str:
     """Return the command that checks a prepared folder and remakes what is missing or changed."""
     flags = [part for name, value in settings.items() for part in (f"--{name}", str(value))]
-    return shlex.join(["python", "-m", "cmig_jax.data.prepare", *flags, "--out", str(folder)])
+    return shlex.join(["cmig", "prepare", *flags, "--out", str(folder)])
 
 
 def read_manifest(folder: Path) -> dict[str, Any]:
@@ -154,7 +157,7 @@ def read_manifest(folder: Path) -> dict[str, Any]:
     """
     path = Path(folder) / MANIFEST
     if not path.is_file():
-        raise ValueError(f"{path} is missing: {folder} was not prepared to its end (python -m cmig_jax.data.prepare --help)")
+        raise ValueError(f"{path} is missing: expected a prepared folder (cmig prepare --help)")
     try:
         manifest = json.loads(path.read_text())
     except ValueError as error:
@@ -164,13 +167,14 @@ def read_manifest(folder: Path) -> dict[str, Any]:
     return manifest
 
 
-def finished_shards(folder: Path, settings: Mapping[str, Any]) -> dict[str, dict[str, Any]]:
-    """Return the shards that are in the manifest or, where a preparation was interrupted, in the notes; by name.
+def completed_shards(folder: Path, settings: Mapping[str, Any]) -> dict[str, dict[str, Any]]:
+    """Return the shards in the manifest or, where a preparation was interrupted, in the notes of `write_note`; by name.
 
     Raises:
         ValueError: they were made with other settings.
     """
-    notes = [json.loads(path.read_text()) for path in sorted(folder.glob("*-?????.json"))]
+    notes = [json.loads(path.read_text()) for path in sorted(folder.glob(NOTES))]
+    notes = [note for note in notes if note["format"] == FORMAT]
     if (folder / MANIFEST).exists():
         manifest = read_manifest(folder)
         notes = [{**manifest, "shard": shard} for shards in manifest["splits"].values() for shard in shards] + notes
@@ -183,56 +187,36 @@ def finished_shards(folder: Path, settings: Mapping[str, Any]) -> dict[str, dict
 
 
 def write_note(folder: Path, settings: Mapping[str, Any], shard: Mapping[str, Any]) -> None:
-    """Note that a shard is finished, until the manifest says so."""
-    with replacing(folder / f"{shard['name']}.json") as file:
-        file.write(json.dumps({"format": FORMAT, "settings": settings, "shard": shard}).encode())
+    """Record that a shard is complete; the manifest will replace these notes."""
+    write_text(folder / f"{shard['name']}.json", json.dumps({"format": FORMAT, "settings": settings, "shard": shard}))
 
 
 def write_manifest(folder: Path, settings: Mapping[str, Any], categories: Sequence[str], shards: Sequence[dict[str, Any]]) -> None:
-    """Write the manifest, then remove the notes that it replaces and what an interruption left."""
+    """Write the manifest, then remove the notes that it replaces and the temporary files of processes that were killed."""
     splits = {split: [shard for shard in shards if shard["name"].startswith(split)] for split in ("train", "test")}
     manifest = {
         "format": FORMAT,
         "settings": settings,
         "categories": list(categories),
-        "distinct": min(shard["distinct"] for shard in shards),
+        "distinct": min(min(shard["distinct"]) for shard in shards),
         "objects": {split: sum(len(shard["names"]) for shard in found) for split, found in splits.items()},
         "splits": {split: found for split, found in splits.items() if found},
     }
-    with replacing(folder / MANIFEST) as file:
-        file.write(json.dumps(manifest, indent=1).encode())
-    for path in (*folder.glob("*-?????.json"), *folder.glob("*.partial")):
+    write_text(folder / MANIFEST, json.dumps(manifest, indent=1))
+    for path in folder.glob(NOTES):
         path.unlink()
+    remove_partial_files(folder)
 
 
 @contextlib.contextmanager
-def replacing(path: Path) -> Iterator[BinaryIO]:
-    """Write a file under a temporary name, flush it to the disk, and rename it; on any error leave nothing."""
-    partial = path.with_name(path.name + ".partial")
-    try:
-        with partial.open("wb") as file:
-            yield file
-            file.flush()
-            os.fsync(file.fileno())
-        partial.replace(path)
-    except BaseException:
-        partial.unlink(missing_ok=True)
-        raise
-
-
-@contextlib.contextmanager
-def only_one(folder: Path) -> Iterator[None]:
-    """Wait until no other process prepares this folder; the lock ends with the process, however it ends."""
-    handle = os.open(folder, os.O_RDONLY)
-    try:
-        fcntl.flock(handle, fcntl.LOCK_EX)
+def locked(folder: Path) -> Iterator[None]:
+    """Prevent other processes from preparing this folder, after waiting for one that does; a process that is killed loses the lock."""
+    with FileLock(folder / LOCK):
         yield
-    finally:
-        os.close(handle)
 
 
 def find_fault(folder: Path, shard: Mapping[str, Any], *, checksum: bool) -> str | None:
-    """Return what is wrong with a shard's files, naming the file, or None."""
+    """Return the fault of a shard's files, with the name of the file, or None."""
     for file in shard["files"].values():
         path = folder / file["name"]
         if not path.is_file():

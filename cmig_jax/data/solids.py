@@ -1,7 +1,7 @@
-"""Closed solids: the bricks of the generated objects.
+"""Closed solids: the parts of the generated objects.
 
-Every brick is a loft: a stack of rings with the same number of corners, joined by triangles and closed by two fans. Lengths are in
-object units, z is up, x is forward. Parts may overlap; each one is closed by itself and faces outwards.
+Every solid is a loft: a stack of rings with the same number of corners, joined by triangles and closed by two fans. Lengths are in
+object units, z is up, x is forward. Solids may overlap; the surface of each is closed and faces outwards.
 """
 
 from __future__ import annotations

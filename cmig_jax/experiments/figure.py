@@ -8,7 +8,7 @@ from matplotlib.figure import Figure
 
 from cmig_jax.experiments.run import Results
 from cmig_jax.experiments.table import spread
-from cmig_jax.report.plots import FAINT, INK, SOURCE, TARGET, save
+from cmig_jax.report.plots import INK, SOURCE, TARGET, save, style_axes
 
 PANELS = (("rmse_r_deg", "RMSE(R), degrees", TARGET), ("mae_r_deg", "MAE(R), degrees", SOURCE))
 
@@ -31,8 +31,7 @@ def plot_rows(name: str, results: Results, path: Path) -> None:
         axes.set_xlim(left=0)
         axes.set_ylim(len(labels) - 0.5, -0.5)
         axes.set_yticks(range(len(labels)), labels)
-        axes.set_xlabel(heading, color=INK)
-        axes.grid(axis="x", color=FAINT, alpha=0.3)
-        axes.spines[["top", "right"]].set_visible(False)
+        style_axes(axes, heading, "")
+        axes.grid(visible=False, axis="y")
     figure.suptitle(name, color=INK, fontsize=11)
     save(figure, path)

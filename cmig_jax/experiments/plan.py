@@ -2,24 +2,22 @@
 
 from __future__ import annotations
 
-import dataclasses
 import functools
 import hashlib
 import json
 import shlex
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any
 
-from cmig_jax.config import Config, from_json, to_json
-from configs import PRESETS
-from configs.experiments import Experiment, Flags, Row
-from configs.scale import at_cpu_scale, at_toy_scale
+from cmig_jax.config import Config
+from cmig_jax.config_json import flat, to_json
+from cmig_jax.data.sources import source_of
+from cmig_jax.experiments.schema import Catalogue, Experiment, Flags, Row
+from cmig_jax.models.networks import config_from_json
 
-Scale = Literal["full", "cpu", "toy"]
-SCALES: dict[Scale, Callable[[Config], Config]] = {"full": lambda config: config, "cpu": at_cpu_scale, "toy": at_toy_scale}
-ABOUT_THE_TEST = ("data.test_categories",)
+ONLY_AT_TEST = ("data.test_categories",)
 """Flags that a training does not depend on."""
 
 
@@ -31,9 +29,10 @@ class Job:
         row: the row.
         seed: of weights, training pairs and their order.
         training: config of its network.
-        test: config whose test pairs it is judged on.
-        run: its run folder; rows that train alike share it.
-        preset: the preset that the command to train starts from.
+        test: config of its test pairs.
+        run: its run folder; rows with the same training share it.
+        preset: name and config of the preset that the command to train starts from.
+        limit: test pairs, evenly spaced, instead of all.
     """
 
     row: Row
@@ -41,7 +40,8 @@ class Job:
     training: Config
     test: Config
     run: Path
-    preset: str
+    preset: tuple[str, Config]
+    limit: int | None = None
 
     @property
     def evaluation(self) -> str:
@@ -50,47 +50,57 @@ class Job:
         return f"{name}-then-{self.row.then.lower()}" if self.row.then else name
 
     def commands(self) -> tuple[str, str]:
-        """Return what to type to train this network, and to evaluate it."""
-        changed = changes(PRESETS[self.preset](), self.training)
-        train = ["python", "train.py", self.preset, *command_line(changed), "--runs", str(self.run.parent)]
-        test = changes(self.training, self.test)
-        return shlex.join(train), shlex.join(["python", "evaluate.py", str(self.run), *command_line(test)])
+        """Return the commands that train this network, and evaluate it."""
+        name, preset = self.preset
+        train = ["python", "train.py", name, *command_line(changes(preset, self.training)), "--runs", str(self.run.parent)]
+        test = ["python", "evaluate.py", str(self.run), *command_line(changes(self.training, self.test))]
+        return shlex.join(train), shlex.join(test + (["--limit", str(self.limit)] if self.limit else []))
 
 
 def plan(
-    experiment: Experiment, *, scale: Scale, roots: Mapping[str, str | None], source: str, seeds: tuple[int, ...], runs: Path
+    experiment: Experiment,
+    catalogue: Catalogue,
+    *,
+    scale: str,
+    roots: Mapping[str, str | None],
+    source: str,
+    seeds: tuple[int, ...],
+    runs: Path,
+    limit: int | None = None,
 ) -> list[Job]:
     """List the jobs of an experiment, row by row.
 
     Args:
         experiment: the table or figure.
-        scale: `full` is the preset's own size, `cpu` the same comparison for two cores, `toy` a test of the machinery.
-        roots: folder of the raw data for each `data.source`.
+        catalogue: presets and scales.
+        scale: a name of `catalogue.scales`.
+        roots: folder of the raw data by the `folder` of a source.
         source: `data.source` of the experiments that name none.
         seeds: of the trainings.
         runs: folder of the run folders.
+        limit: test pairs, evenly spaced, instead of all.
 
     Raises:
         ValueError: flags that exclude each other, naming them.
     """
-    return [_job(experiment, row, seed, scale, roots, source, runs) for row in experiment.rows for seed in seeds]
+    at_scale = catalogue.scales[scale]
 
+    def job(row: Row, seed: int) -> Job:
+        preset = catalogue.presets[row.preset]()
+        chosen = with_flags(preset, {"data.source": source} | dict(experiment.protocol) | dict(row.flags))
+        scaled = changes(at_scale(preset), at_scale(chosen))  # what a scale sets for all rows is no difference
+        differing = {f: v for f, v in changes(preset, chosen).items() if f in scaled and f not in ONLY_AT_TEST}
+        name = run_name(row.preset, differing, seed)
+        configs = (replace(at_scale(config), name=name, seed=seed) for config in (chosen, with_flags(chosen, row.test)))
+        training, test = (_at_root(config, roots) for config in configs)
+        nearest = f"{row.preset}-{scale}" if f"{row.preset}-{scale}" in catalogue.presets else row.preset
+        return Job(row, seed, training, test, runs / name, (nearest, catalogue.presets[nearest]()), limit)
 
-def _job(experiment: Experiment, row: Row, seed: int, scale: Scale, roots: Mapping[str, str | None], source: str, runs: Path) -> Job:
-    preset = PRESETS[row.preset]()
-    chosen = with_flags(preset, {"data.source": source} | dict(experiment.protocol) | dict(row.flags))
-    scaled = changes(SCALES[scale](preset), SCALES[scale](chosen))  # what a scale sets for all is no difference
-    differing = {f: v for f, v in changes(preset, chosen).items() if f in scaled and f not in ABOUT_THE_TEST}
-    name = run_name(row.preset, differing, seed)
-    training, test = (
-        _at_root(replace(SCALES[scale](config), name=name, seed=seed), roots) for config in (chosen, with_flags(chosen, row.test))
-    )
-    nearest = f"{row.preset}-cpu" if scale == "cpu" else row.preset
-    return Job(row, seed, training, test, runs / name, nearest)
+    return [job(row, seed) for row in experiment.rows for seed in seeds]
 
 
 def _at_root(config: Config, roots: Mapping[str, str | None]) -> Config:
-    return replace(config, data=replace(config.data, root=roots.get(config.data.source)))
+    return replace(config, data=replace(config.data, root=roots.get(source_of(config.data).folder or "")))
 
 
 def run_name(preset: str, flags: Flags, seed: int) -> str:
@@ -103,38 +113,34 @@ def run_name(preset: str, flags: Flags, seed: int) -> str:
 
 
 def with_flags(config: Config, flags: Flags) -> Config:
-    """Change flags, named as on the command line with dots and underscores.
+    """Change flags by their dotted names.
 
     Raises:
         ValueError: no such flag, a value outside its choices, or flags that exclude each other.
     """
-    known = dict(_flat(dataclasses.asdict(config)))
-    values = json.loads(to_json(config))
+    known, values = flat(config), json.loads(to_json(config))
     for flag, value in flags.items():
         if flag not in known:
             raise ValueError(f"{flag}: expected the name of a flag")
         *groups, last = flag.split(".")
         group = functools.reduce(dict.__getitem__, groups, values)
         group[last] = list(value) if isinstance(value, tuple) else value
-    return from_json(json.dumps(values))
+    return config_from_json(json.dumps(values))
 
 
 def changes(old: Config, new: Config) -> dict[str, Any]:
-    """Return the flags in which `new` differs from `old`, with their values there; the name and the seed included."""
-    before, after = dict(_flat(dataclasses.asdict(old))), dict(_flat(dataclasses.asdict(new)))
-    return {flag: value for flag, value in after.items() if value != before[flag]}
+    """Return the flags in which `new` differs from `old`, with their new values; the name and the seed included."""
+    before = flat(old)
+    return {flag: value for flag, value in flat(new).items() if flag not in before or value != before[flag]}
 
 
 def command_line(flags: Flags) -> Iterator[str]:
     """Write flags as `train.py` takes them."""
     for flag, value in flags.items():
-        yield f"--{flag.replace('_', '-')}"
-        yield from map(str, value if isinstance(value, tuple) else (value,))
-
-
-def _flat(tree: Mapping[str, Any], prefix: str = "") -> Iterator[tuple[str, Any]]:
-    for name, value in tree.items():
-        if isinstance(value, Mapping):
-            yield from _flat(value, f"{prefix}{name}.")
+        name = flag.replace("_", "-")
+        if isinstance(value, bool):
+            group, _, last = name.rpartition(".")
+            yield f"--{group}.{'' if value else 'no-'}{last}"
         else:
-            yield f"{prefix}{name}", value
+            yield f"--{name}"
+            yield from map(str, value if isinstance(value, tuple) else (value,))

@@ -7,9 +7,9 @@ from collections.abc import Mapping, Sequence
 from dataclasses import asdict
 from typing import Any
 
+from cmig_jax.evaluation.tables import COLUMNS, Column, latex_rows, latex_text, markdown_rows, text_rows
 from cmig_jax.experiments.run import Outcome, Results
-from cmig_jax.report.tables import COLUMNS, Column, aligned, latex_text
-from configs.experiments import Experiment, Row
+from cmig_jax.experiments.schema import Experiment, Row
 
 SHOWN = tuple(column for column in COLUMNS if column.key in ("rmse_r_deg", "mae_r_deg", "rmse_t", "mae_t", "recall", "seconds_per_pair"))
 QUOTED = tuple(column for column in SHOWN if column.key in ("rmse_r_deg", "mae_r_deg", "rmse_t", "mae_t"))
@@ -21,7 +21,7 @@ def table(experiment: Experiment, results: Results, style: str = "text") -> str:
 
     Args:
         experiment: the table or figure.
-        results: what became of its jobs.
+        results: of its jobs.
         style: `text` for a terminal, `markdown`, or `latex` (package booktabs).
     """
     rows = [[name, "", *(_cell(column, [metrics]) for column in SHOWN)] for name, metrics in results.baselines.items()]
@@ -32,7 +32,9 @@ def table(experiment: Experiment, results: Results, style: str = "text") -> str:
         figures = [empty] * len(results.baselines) + [_quoted(row) for row in experiment.rows]
         rows = [[*row, *cells] for row, cells in zip(rows, figures, strict=True)]
     headings = ["", "seeds", *(f"{c.heading} [{c.unit}]" for c in SHOWN), *(f"quoted {c.heading}" for c in QUOTED if quoted)]
-    return {"text": _text, "markdown": _markdown, "latex": _latex}[style](headings, rows)
+    if style == "latex":
+        headings, *rows = [[latex_text(cell) for cell in row] for row in [headings, *rows]]
+    return {"text": text_rows, "markdown": markdown_rows, "latex": latex_rows}[style]([headings], rows)
 
 
 def notes(results: Results) -> list[str]:
@@ -88,19 +90,3 @@ def _quoted(row: Row) -> list[str]:
         return [EMPTY] * len(QUOTED)
     values = asdict(row.quoted)
     return [f"{values[column.key]:.{max(column.digits, 3)}f}" for column in QUOTED]
-
-
-def _text(headings: list[str], rows: list[list[str]]) -> str:
-    lines = aligned([headings, *rows])
-    return "\n".join([lines[0], "-" * len(lines[0]), *lines[1:]]) + "\n"
-
-
-def _markdown(headings: list[str], rows: list[list[str]]) -> str:
-    lines = [headings, ["---", *["---:"] * (len(headings) - 1)], *[[cell.replace("|", r"\|") for cell in row] for row in rows]]
-    return "".join(f"| {' | '.join(line)} |\n" for line in lines)
-
-
-def _latex(headings: list[str], rows: list[list[str]]) -> str:
-    body = [" & ".join(latex_text(cell) for cell in line) + r" \\" for line in [headings, *rows]]
-    start = rf"\begin{{tabular}}{{l{'r' * (len(headings) - 1)}}}"
-    return "\n".join([start, r"\toprule", body[0], r"\midrule", *body[1:], r"\bottomrule", r"\end{tabular}"]) + "\n"

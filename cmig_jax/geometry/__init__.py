@@ -1,1 +1,1 @@
-"""Pure jax.numpy geometry: rotations, weighted Procrustes with its derivative, neighbours. No parameters, no flax."""
+"""Geometry in jax.numpy, without parameters and without flax: distances, rotations, weighted Procrustes."""

@@ -1,1 +1,1 @@
-"""The network's modules (Fig. 2): linen, plain typed fields, no losses, no config objects; `build` alone reads the flags."""
+"""Layers that networks share: plain linen modules with typed fields, without losses and without the flags of a network."""

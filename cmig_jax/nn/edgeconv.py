@@ -1,8 +1,8 @@
 """Point encoder: densely linked EdgeConv layers (Sec. III-A, "we employ channel connectivity").
 
 An edge layer applies one matrix W to `[x_j - x_i, x_i]` for every neighbour j of i. With W = [A, B] that is
-`A x_j + (B - A) x_i`: two products per point and one gather instead of k products, and the same numbers. BatchNorm and ReLU rise
-(or, under a negative scale, fall) with their argument, so the maximum over neighbours is taken before them; the batch statistics
+`A x_j + (B - A) x_i`: two products per point and one gather instead of k products, and the same numbers. BatchNorm and ReLU increase
+(or, for a negative scale, decrease) with their argument, so the maximum over neighbours is taken before them; the batch statistics
 of the edges follow from those of the points.
 """
 
@@ -15,15 +15,18 @@ import jax
 import jax.numpy as jnp
 from jax import Array
 
-from cmig_jax.geometry.neighbors import knn, neighbour_maximum
+from cmig_jax.config import ComputeConfig
 from cmig_jax.nn.mlp import Dense, torch_kernel
-from cmig_jax.nn.norm import Affine, BatchNorm, Moments, channels, moments
+from cmig_jax.nn.norm import BatchNorm
+from cmig_jax.ops.edges import edge_moments, neighbour_maximum
+from cmig_jax.ops.moments import channels, moments
+from cmig_jax.ops.neighbours import knn
 
 Clouds = tuple[Array, ...]
 
 
 class PointEncoder(nn.Module):
-    """EdgeConv layers, each on everything before it, and a last pointwise layer.
+    """EdgeConv layers, each on the outputs of all layers before it, and a last pointwise layer.
 
     The graph of a layer joins the k nearest points in the output of the layer before (in the coordinates, for the first).
     """
@@ -31,21 +34,21 @@ class PointEncoder(nn.Module):
     k: int = 20
     widths: tuple[int, ...] = (64, 64, 64, 128)
     dim: int = 512
-    rows: int = 0
-    dtype: jnp.dtype | None = None
+    compute: ComputeConfig = ComputeConfig()
 
     @nn.compact
     def __call__(self, clouds: Clouds, *, train: bool) -> Clouds:
         """Encode clouds, each `[B, N_c, 3]`, to `[B, N_c, dim]`; batch statistics are taken over all of them together."""
         collected, latest = [(cloud,) for cloud in clouds], clouds
         for i, width in enumerate(self.widths):
-            neighbours = tuple(knn(x, self.k, self.rows) for x in latest)
+            neighbours = tuple(knn(x, self.k, self.compute) for x in latest)
             inputs = tuple(jnp.concatenate(parts, axis=-1) for parts in collected)
-            latest = EdgeConv(width, dtype=self.dtype, name=f"edge_{i}")(inputs, neighbours, train=train)
+            latest = EdgeConv(width, self.compute, name=f"edge_{i}")(inputs, neighbours, train=train)
             collected = [(*parts, x) for parts, x in zip(collected, latest, strict=True)]
-        dense = Dense(self.dim, use_bias=False, dtype=self.dtype, name="last")
+        dense = Dense(self.dim, use_bias=False, compute=self.compute, name="last")
         outputs = tuple(dense(jnp.concatenate(parts, axis=-1)) for parts in collected)
-        affine = BatchNorm(self.dim, name="last_norm").affine(moments(outputs) if train else None)
+        batch = moments(outputs, self.compute.kernels) if train else None
+        affine = BatchNorm(self.dim, self.compute, name="last_norm").affine(batch)
         return tuple(nn.relu(affine(x)).astype(cloud.dtype) for x, cloud in zip(outputs, clouds, strict=True))
 
 
@@ -53,25 +56,25 @@ class EdgeConv(nn.Module):
     """One edge layer with BatchNorm, ReLU and the maximum over neighbours (Wang et al., TOG 2019)."""
 
     features: int
-    dtype: jnp.dtype | None = None
+    compute: ComputeConfig = ComputeConfig()
 
     @nn.compact
     def __call__(self, clouds: Clouds, neighbours: Clouds, *, train: bool) -> Clouds:
         """Map clouds, each `[B, N_c, C]` with neighbours `[B, N_c, k]`, to `[B, N_c, features]`."""
         C = clouds[0].shape[-1]
         kernel = self.param("kernel", torch_kernel, (2 * C, self.features))
-        norm = BatchNorm(self.features, name="norm")
-        sign = jnp.where(norm.scale < 0, -1, 1).astype(kernel.dtype)  # a falling BatchNorm turns the maximum into a minimum
+        norm = BatchNorm(self.features, self.compute, name="norm")
+        sign = jnp.where(norm.scale < 0, -1, 1).astype(kernel.dtype)  # a negative scale turns the maximum into a minimum
         projections = [self._project(x, kernel, sign) for x in clouds]
         neighbour, shift_neighbour = _centred([p for p, _ in projections])
         centre, shift_centre = _centred([q for _, q in projections])
         shift = shift_neighbour + shift_centre
-        batch = _edge_moments(neighbour, centre, neighbours) if train else None
+        batch = edge_moments(neighbour, centre, neighbours, self.compute) if train else None
         affine = norm.affine(None if batch is None else dataclasses.replace(batch, mean=(batch.mean + shift) * sign))
-        affine = Affine(mean=affine.mean * sign - shift, scale=affine.scale * sign, bias=affine.bias)
+        affine = dataclasses.replace(affine, mean=affine.mean * sign - shift, scale=affine.scale * sign)
         outputs = []
         for p, q, index in zip(neighbour, centre, neighbours, strict=True):
-            edge = neighbour_maximum(p, index) + q
+            edge = neighbour_maximum(p, index, self.compute.kernels) + q
             outputs.append(nn.relu(affine(edge)).astype(clouds[0].dtype))
         return tuple(outputs)
 
@@ -79,34 +82,13 @@ class EdgeConv(nn.Module):
         """Return `A x` and `(B - A) x`, signed, `[B, N, features]` each."""
         A, B = jnp.split(kernel * sign[None, :], 2)
         both = jnp.concatenate([A, B - A], axis=-1)
-        if self.dtype is not None:
-            x, both = x.astype(self.dtype), both.astype(self.dtype)
+        if self.compute.dtype is not None:
+            x, both = x.astype(self.compute.dtype), both.astype(self.compute.dtype)
         p, q = jnp.split((x @ both).astype(kernel.dtype), 2, axis=-1)
         return p, q
 
 
-def _centred(parts: list[Array]) -> tuple[list[Array], Array]:
-    """Take a rough mean `[C]` off every part, so that squares keep their digits; return it too."""
+def _centred(parts: list[Array]) -> tuple[Clouds, Array]:
+    """Subtract a rough mean `[C]` from every part, so that squares keep their digits; return it too."""
     shift = jax.lax.stop_gradient(jnp.mean(jnp.stack([jnp.mean(x, axis=(0, 1)) for x in parts]), axis=0))
-    return [x - channels(shift, 3) for x in parts], shift
-
-
-def _edge_moments(neighbour: list[Array], centre: list[Array], neighbours: Clouds) -> Moments:
-    """Statistics of `p_j + q_i` over all edges, from sums over points: of p by in-degree, of p_j q_i by the adjacency matrix."""
-    k = neighbours[0].shape[-1]
-    count = k * sum(p.shape[0] * p.shape[1] for p in neighbour)
-    first, second = jnp.zeros_like(neighbour[0][0, 0]), jnp.zeros_like(neighbour[0][0, 0])
-    for p, q, index in zip(neighbour, centre, neighbours, strict=True):
-        adjacency = _adjacency(index, p.shape[1], p.dtype)
-        degree = jnp.sum(adjacency, axis=1)[..., None]
-        summed = jnp.einsum("bnm,bmc->bnc", adjacency, p)
-        first += jnp.sum(degree * p + k * q, axis=(0, 1))
-        second += jnp.sum(degree * p**2 + 2 * summed * q + k * q**2, axis=(0, 1))
-    mean = first / count
-    return Moments(mean=mean, variance=second / count - mean**2, count=count)
-
-
-def _adjacency(index: Array, points: int, dtype: jnp.dtype) -> Array:
-    """Return `[B, N, N]`, 1 where the column is a neighbour of the row, from neighbours `[B, N, k]`."""
-    rows = jnp.arange(index.shape[1])[:, None]
-    return jax.vmap(lambda i: jnp.zeros((index.shape[1], points), dtype).at[rows, i].set(1, unique_indices=True))(index)
+    return tuple(x - channels(shift, 3) for x in parts), shift

@@ -1,142 +1,90 @@
-"""Sums over all pairs of keypoints that are never stored: the first layer of the networks over pairs.
-
-Such a layer is a sum of `S_ij * (a_i + b_j)` with few S (`PairSum`). Its batch statistics follow from sums and products over points,
-and its values are made where they are read, a few rows of source keypoints at a time (`nn/tower.py`).
-"""
+"""Networks over all pairs of keypoints (Sec. III-E, Fig. 5): a first layer on two sets of points, then layers to one number per pair."""
 
 from __future__ import annotations
 
-import jax
+import itertools
+
+import flax.linen as nn
 import jax.numpy as jnp
-from flax import struct
 from jax import Array
 
-from cmig_jax.nn.norm import Affine, Moments
-
-HIGHEST = jax.lax.Precision.HIGHEST
-ROWS_TO_ADD = 32  # up to so many, one by one in one pass
-
-
-@struct.dataclass
-class PairTerm:
-    """Values over pairs, `scale_ij * (row_i + column_j)`: `[B, N, M]`, `[B, N, C]` or None for 0, `[B, M, C]` or `[1, 1, C]`."""
-
-    scale: Array
-    row: Array | None
-    column: Array
-
-    @property
-    def has_one_column(self) -> bool:
-        """Whether all columns are one vector, that of all pairs of clouds too."""
-        return self.column.shape[:2] == (1, 1)
-
-    def times(self, factor: Array) -> PairTerm:
-        """Multiply the channels by `factor [C]`."""
-        factor = factor[None, None, :]
-        return PairTerm(self.scale, None if self.row is None else self.row * factor, self.column * factor)
+from cmig_jax.config import ComputeConfig
+from cmig_jax.geometry.distances import COORDINATES, pair_distances
+from cmig_jax.nn.mlp import Weights, torch_kernel
+from cmig_jax.nn.norm import BatchNorm
+from cmig_jax.ops.moments import Affine
+from cmig_jax.ops.pair_layers import PairValues, first_layer
+from cmig_jax.ops.pairs import PairSum, PairTerm
 
 
-@struct.dataclass
-class PairSum:
-    """Values over pairs: `row_i` `[B, N, C]` and terms."""
+class PairLayer(nn.Module):
+    """The first layer over pairs: a matrix W on `[d, (b_j - a_i) / (d + 1e-8), extra_i]`, d = |b_j - a_i|, without bias.
 
-    row: Array
-    terms: tuple[PairTerm, ...]
+    Of features, W's middle part is applied to each cloud and the difference taken afterwards: two products per point instead of one
+    per pair. Coordinates are subtracted first: a source that the pose has brought onto the target is 1e-7 away from it, and the
+    rounding of the difference of two products, divided by that, would dominate the batch statistics. `reverse` takes a_i - b_j, as the
+    reference does for coordinates.
+    """
 
-    def __add__(self, other: PairSum) -> PairSum:
-        return PairSum(self.row + other.row, self.terms + other.terms)
+    features: int
+    reverse: bool = False
+    compute: ComputeConfig = ComputeConfig()
 
-    def values(self) -> Array:
-        """Return `[B, N, M, C]`."""
-        return _values(self)
-
-    def moments(self) -> Moments:
-        """Take mean and variance per channel from sums over points; everything is centred first, so that squares keep their digits."""
-        row, column, terms = self.row, jnp.zeros_like(self.row[:1, :1]), []
-        for t in self.terms:
-            middle = jnp.mean(t.scale)
-            row = row if t.row is None else row + middle * t.row
-            column = column + middle * t.column
-            terms.append(PairTerm(t.scale - middle, t.row, t.column))
-        means = [jnp.mean(x, axis=(0, 1), keepdims=True) for x in (row, column)]
-        terms.append(PairTerm(jnp.ones_like(terms[0].scale), row - means[0], column - means[1]))
-        first, second = jnp.zeros_like(row[0, 0]), jnp.zeros_like(row[0, 0])
-        for i, one in enumerate(terms):
-            first += _total(one)
-            second += _product_of(one, one)
-            for other in terms[:i]:
-                second += 2 * _product_of(one, other)
-        count = terms[0].scale.size
-        mean = first / count
-        return Moments(mean=mean + (means[0] + means[1])[0, 0], variance=second / count - mean**2, count=count)
-
-    def normalised(self, affine: Affine) -> PairSum:
-        """Apply what BatchNorm does to a channel."""
-        return PairSum(affine(self.row), tuple(t.times(affine.scale) for t in self.terms))
-
-
-def _total(term: PairTerm) -> Array:
-    """Sum a term over pairs, `[C]`."""
-    if term.has_one_column:
-        total = jnp.sum(term.scale) * term.column[0, 0]
-    else:
-        total = jnp.sum(jnp.sum(term.scale, axis=1)[..., None] * term.column, axis=(0, 1))
-    return total if term.row is None else total + jnp.sum(jnp.sum(term.scale, axis=2)[..., None] * term.row, axis=(0, 1))
-
-
-def _product_of(one: PairTerm, other: PairTerm) -> Array:
-    """Sum the product of two terms over pairs, `[C]`."""
-    both = one.scale * other.scale
-    rows = None if one.row is None or other.row is None else one.row * other.row
-    total = _total(PairTerm(both, rows, one.column * other.column))
-    for row, term in ((one.row, other), (other.row, one)):
-        if row is not None:
-            total = total + jnp.sum(row * _over_columns(both, term), axis=(0, 1))
-    return total
-
-
-def _over_columns(weight: Array, term: PairTerm) -> Array:
-    """Sum `weight_ij column_j` over the columns of a term, `[B, N, C]`."""
-    if term.has_one_column:
-        return jnp.sum(weight, axis=2)[..., None] * term.column
-    return jnp.einsum("bnm,bmc->bnc", weight, term.column, precision=HIGHEST)
-
-
-@jax.custom_vjp
-def _values(pairs: PairSum) -> Array:
-    total = pairs.row[:, :, None]
-    for t in pairs.terms:
-        column = t.column[:, None]
-        total = total + t.scale[..., None] * (column if t.row is None else column + t.row[:, :, None])
-    return total
-
-
-def _values_backward(pairs: PairSum, gradient: Array) -> tuple[PairSum]:
-    """Differentiate by hand, with sums over columns and channels as products: XLA's sums take many times as long on a CPU."""
-    weights = jnp.stack([jnp.ones_like(pairs.terms[0].scale), *(t.scale for t in pairs.terms)], axis=2)
-    of_rows = jnp.einsum("bntm,bnmc->bntc", weights, gradient, precision=HIGHEST)
-    terms = []
-    for i, t in enumerate(pairs.terms, 1):
-        if t.has_one_column:
-            of_column = jnp.sum(of_rows[:, :, i], axis=(0, 1), keepdims=True)
-            of_scale = jnp.matmul(gradient, t.column[0, 0], precision=HIGHEST)
+    @nn.compact
+    def __call__(self, a: Array, b: Array, extra: Array | None = None) -> PairSum:
+        """Map rows `a [B, N, C]`, columns `b [B, M, C]` and row numbers `extra [B, N, E]` to pairs of `features` channels."""
+        C, E = a.shape[-1], 0 if extra is None else extra.shape[-1]
+        kernel = self.param("kernel", torch_kernel, (1 + C + E, self.features))
+        dtype, wide = self.compute.dtype or kernel.dtype, kernel.dtype
+        length, direction, rest = jnp.split(kernel.astype(dtype), (1, 1 + C))
+        distance = pair_distances(a, b)
+        # No length, no direction: the factor 1e8 would magnify the rounding of the difference.
+        scale = jnp.where(distance > 0, 1 / (distance + 1e-8), 0)
+        scale = -scale if self.reverse else scale
+        terms = (PairTerm(distance, None, length.astype(wide)[None]),)
+        if C <= COORDINATES:
+            unit = (b[:, None] - a[:, :, None]) * scale[..., None]
+            terms += tuple(PairTerm(unit[..., c], None, direction.astype(wide)[None, c : c + 1]) for c in range(C))
         else:
-            of_column = _sum_of_rows(t.scale, gradient)
-            of_scale = jnp.matmul(gradient * t.column[:, None], jnp.ones_like(gradient[0, 0, 0]), precision=HIGHEST)
-        if t.row is not None:
-            of_scale = of_scale + jnp.einsum("bnmc,bnc->bnm", gradient, t.row, precision=HIGHEST)
-        terms.append(PairTerm(of_scale, None if t.row is None else of_rows[:, :, i], of_column))
-    return (PairSum(of_rows[:, :, 0], tuple(terms)),)
+            centre = jnp.mean(b, axis=-2, keepdims=True)  # cancels in the difference, and would cost it digits
+            row, column = (((x - centre).astype(dtype) @ direction).astype(wide) for x in (a, b))
+            terms += (PairTerm(scale, -row, column),)
+        own = jnp.zeros((*a.shape[:2], self.features), wide) if extra is None else (extra.astype(dtype) @ rest).astype(wide)
+        return PairSum(own, terms)
 
 
-def _sum_of_rows(weight: Array, x: Array) -> Array:
-    """Sum `weight [B, N, M]` times `x [B, N, M, C]` over N, to `[B, M, C]`."""
-    if weight.shape[1] > ROWS_TO_ADD:
-        return jnp.einsum("bnm,bnmc->bmc", weight, x, precision=HIGHEST)
-    total = weight[:, 0, :, None] * x[:, 0]
-    for i in range(1, weight.shape[1]):
-        total = total + weight[:, i, :, None] * x[:, i]
-    return total
+class PairNetwork(nn.Module):
+    """The layers after the first: BatchNorm and ReLU, more layers of linear, BatchNorm, ReLU, and one number per pair.
+
+    `pooled` also returns the last hidden layer's maximum over targets.
+    """
+
+    widths: tuple[int, ...]
+    pooled: bool = False
+    compute: ComputeConfig = ComputeConfig()
+
+    @nn.compact
+    def __call__(self, pairs: PairSum, *, train: bool) -> tuple[Array, Array | None]:
+        """Map pairs of `widths[0]` channels to similarities `[B, N, M]` and, if asked for, `[B, N, widths[-1]]`."""
+        values = first_layer(pairs, max(self.widths), self.compute)
+        affine = BatchNorm(self.widths[0], self.compute, name="first_norm").affine(values.moments() if train else None)
+        values, affine = HiddenLayers(self.widths, self.compute, name="hidden")(values, affine, train=train)
+        kernel, bias = Weights(self.widths[-1], 1, name="last")()
+        assert bias is not None
+        return values.last(affine, kernel.astype(self.compute.dtype or kernel.dtype), bias, self.pooled)
 
 
-_values.defvjp(lambda pairs: (_values(pairs), pairs), _values_backward)
+class HiddenLayers(nn.Module):
+    """Layers of ReLU, linear (no bias), BatchNorm over pairs."""
+
+    widths: tuple[int, ...]
+    compute: ComputeConfig = ComputeConfig()
+
+    @nn.compact
+    def __call__(self, values: PairValues, affine: Affine, *, train: bool) -> tuple[PairValues, Affine]:
+        """Map values of `widths[0]` channels and their normalisation to those of `widths[-1]` channels."""
+        for i, (inputs, width) in enumerate(itertools.pairwise(self.widths)):
+            kernel, _ = Weights(inputs, width, use_bias=False, name=f"layer_{i}")()
+            values = values.then(affine, kernel.astype(self.compute.dtype or kernel.dtype))
+            affine = BatchNorm(width, self.compute, name=f"norm_{i}").affine(values.moments() if train else None)
+        return values, affine

@@ -1,4 +1,4 @@
-"""Gradient checkpointing: what a module computes is thrown away and computed again where the derivative needs it (Chen et al., 2016)."""
+"""Gradient checkpointing: what a module computes is discarded, and computed again for the derivative (Chen et al., 2016)."""
 
 from __future__ import annotations
 
@@ -7,10 +7,10 @@ from typing import Any
 import flax.linen as nn
 
 
-def applied(module: nn.Module, *inputs: Any, recompute: bool, **flags: Any) -> Any:
-    """Call a module; with `recompute`, its derivative keeps only `inputs` and computes the rest again. `flags` are no arrays."""
+def call(module: nn.Module, *inputs: Any, recompute: bool, **options: Any) -> Any:
+    """Call a module; with `recompute`, its derivative keeps only `inputs` and computes the rest again. `options` are not arrays."""
 
-    def call(module: nn.Module, *inputs: Any) -> Any:
-        return module(*inputs, **flags)
+    def run(module: nn.Module, *inputs: Any) -> Any:
+        return module(*inputs, **options)
 
-    return (nn.remat(call) if recompute else call)(module, *inputs)
+    return (nn.remat(run) if recompute else run)(module, *inputs)

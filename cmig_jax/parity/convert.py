@@ -1,65 +1,91 @@
-"""Convert weights between PyTorch files and run folders."""
+"""Conversion of CMIGNet's weights between PyTorch files and run folders, without loss.
+
+A run folder is what `train.py` writes: `config.json` and `checkpoints/`. A converted one also has `pytorch_only.npz`: the tensors that
+the Flax network has no place for, and those that its float32 rounds.
+"""
 
 from __future__ import annotations
 
-from collections.abc import Mapping
 from pathlib import Path
+from typing import Any
 
+import jax
+import jax.numpy as jnp
 import numpy as np
-from numpy.typing import NDArray
 
-from cmig_jax.parity.files import PYTORCH_ONLY, TORCH_SUFFIXES, read_run, read_torch, write_run, write_torch
-from cmig_jax.parity.layout import places
-from cmig_jax.parity.recorded import Arrays
-from cmig_jax.parity.sizes import Sizes, released, sizes_of
-from cmig_jax.parity.weights import Converted, sizes_of_state, to_flax, to_torch
+from cmig_jax.config import Config
+from cmig_jax.files import replacing
+from cmig_jax.inference.load import load
+from cmig_jax.models.cmignet.flags import CMIGNetFlags
+from cmig_jax.parity.cases import State
+from cmig_jax.parity.cmignet_layout import flags_of_state, layout
+from cmig_jax.parity.torch_files import SUFFIXES, is_torch_file, read_torch, write_torch
+from cmig_jax.parity.weights import COUNTER, to_flax, to_torch
+from cmig_jax.training.checkpoint import Checkpoints, write_config
+from cmig_jax.training.optim import optimizer
+from cmig_jax.training.state import state_of
+
+PYTORCH_ONLY = "pytorch_only.npz"
 
 
 def convert(source: Path, target: Path) -> list[str]:
-    """Convert `source` to `target`: each is a PyTorch file (by its suffix) or else a run folder.
+    """Convert `source` to `target`; each is a PyTorch file (by its suffix) or else a run folder.
 
     Returns:
-        lines that say what was done.
+        Lines that say what was done.
 
     Raises:
-        ValueError: unreadable, not the released network, or the target folder exists.
+        ValueError: unreadable, not of the released network's kind, or the target folder exists.
     """
-    if source.suffix in TORCH_SUFFIXES and not source.is_dir():
-        state = read_torch(source)
-        sizes = sizes_of_state(state)
-        converted = to_flax(state, sizes)
-        if target.suffix in TORCH_SUFFIXES:
-            write_torch(target, state)
-            return [f"{target}: {len(state)} tensors"]
-        write_run(target, released(sizes), converted.variables, _beside(state, converted, sizes))
-        return [f"{target}: a run folder, {sizes.iterations} iterations", *_report(converted)]
-    if target.suffix not in TORCH_SUFFIXES:
-        raise ValueError(f"{target}: expected a PyTorch file ({', '.join(TORCH_SUFFIXES)}), to convert the run folder {source} to")
-    config, variables, extra = read_run(source)
-    sizes = sizes_of(config.model)
-    placed = {place.name for place in places(sizes)}
-    state, filled = to_torch(variables, sizes, {name: value for name, value in extra.items() if name not in placed})
-    state |= {name: extra[name] for name in placed & set(extra) if _rounds_to(extra[name], state[name])}
-    write_torch(target, state)
-    lines = [f"{target}: {len(state)} tensors"]
-    return lines + ([f"filled with zeros, since JAX has no such tensor: {', '.join(filled)}"] if filled else [])
+    if not is_torch_file(source):
+        if not is_torch_file(target):
+            raise ValueError(f"{target}: expected a PyTorch file ({', '.join(SUFFIXES)}), to convert the run folder {source} to")
+        return _to_file(source, target)
+    state = read_torch(source)
+    if not is_torch_file(target):
+        return _to_run(target, state)
+    tensors = layout(flags_of_state(state))
+    to_flax(state, tensors)  # checks it
+    write_torch(target, {tensor.name: state[tensor.name] for tensor in tensors})
+    return [f"{target}: {len(state)} tensors"]
 
 
-def _beside(state: Mapping[str, NDArray], converted: Converted, sizes: Sizes) -> Arrays:
-    """Return what the checkpoint's float32 variables cannot give back."""
-    exact = {place.name: state[place.name] for place in places(sizes) if state[place.name].dtype != np.float32}
-    return converted.kept | exact
-
-
-def _rounds_to(exact: NDArray, stored: NDArray) -> bool:
-    """Say whether a tensor is what was converted, but for rounding (and not what training made of it)."""
-    return np.array_equal(exact.astype(np.float32), stored, equal_nan=True)
-
-
-def _report(converted: Converted) -> list[str]:
-    counters = [name for name in converted.kept if name.endswith("num_batches_tracked")]
-    unused = [name for name in converted.unused if name not in counters]
+def _to_run(run: Path, state: State) -> list[str]:
+    """Write a run folder whose one checkpoint holds the weights, after step 0."""
+    if run.exists():
+        raise ValueError(f"{run}: expected a new folder, this one exists")
+    flags = flags_of_state(state)
+    config, (variables, beside) = Config(name="released", model=flags), to_flax(state, layout(flags))
+    exact = {name: value for name, value in state.items() if value.dtype != np.float32}
+    write_config(run, config)
+    checkpoints, rounded = Checkpoints(run), jax.tree.map(lambda x: jnp.asarray(x, jnp.float32), variables)
+    checkpoints.save(0, state_of(rounded, optimizer(config.optim, 1)), iterator={})
+    checkpoints.close()
+    kept: dict[str, Any] = beside | exact
+    with replacing(run / PYTORCH_ONLY) as file:
+        np.savez(file, **kept)
+    unused = [name for name in beside if not name.endswith(COUNTER)]
     return [
+        f"{run}: a run folder, {flags.matching.iterations} iterations",
         f"never used by the network, kept in {PYTORCH_ONLY} for the way back: {', '.join(unused)}",
-        f"{len(counters)} counters num_batches_tracked kept there too",
+        f"{len(beside) - len(unused)} counters {COUNTER} kept there too",
     ]
+
+
+def _to_file(run: Path, path: Path) -> list[str]:
+    """Write a state file. A tensor that training did not change gets back the value that was converted, unrounded."""
+    network, kept = load(run), {}
+    flags = network.config.model
+    if not isinstance(flags, CMIGNetFlags):
+        raise ValueError(f"{run}: expected the network cmignet, found {flags.network}")
+    if (run / PYTORCH_ONLY).exists():
+        with np.load(run / PYTORCH_ONLY, allow_pickle=False) as file:
+            kept = {name: file[name] for name in file.files}
+    placed = {tensor.name for tensor in layout(flags) if tensor.path}
+    beside = {name: value for name, value in kept.items() if name not in placed}
+    state, filled = to_torch(jax.device_get(network.variables), layout(flags), beside)
+    for name in placed & set(kept):
+        if np.array_equal(kept[name].astype(np.float32), state[name], equal_nan=True):
+            state[name] = kept[name]
+    write_torch(path, state)
+    return [f"{path}: {len(state)} tensors"] + ([f"filled with zeros, as JAX has none: {', '.join(filled)}"] if filled else [])

@@ -1,13 +1,13 @@
-"""Weights both ways between a PyTorch `state_dict` of the released network and Flax variables, without loss.
+"""Weights of any network both ways between a PyTorch `state_dict` and Flax variables, without loss.
 
-A state is a dict of numpy arrays under PyTorch names and layouts; variables are `{"params": ..., "batch_stats": ...}` of numpy
-arrays. What the Flax network has no place for (parameters that the released network never uses, `num_batches_tracked`) travels
-beside the variables, so that the way back gives every tensor again. Numbers keep their type.
+A state is a dict of NumPy arrays under PyTorch names and in PyTorch's layout; variables are `{"params": ..., "batch_stats": ...}`. A
+layout lists every tensor of the state in its order. Tensors without a place in the variables travel beside them. Types are kept.
 """
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+import zlib
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -15,118 +15,110 @@ import numpy as np
 from flax import traverse_util
 from numpy.typing import NDArray
 
-from cmig_jax.parity.layout import places
-from cmig_jax.parity.recorded import Arrays
-from cmig_jax.parity.sizes import Sizes
-from cmig_jax.parity.twin_run import state_shapes
+from cmig_jax.parity.cases import Arrays, State
 
-UNUSED = ("significance_fc.", "MVCNN.fc.", "head.")
+COUNTER, RUNNING = "num_batches_tracked", ("running_mean", "running_var")
 
 
 @dataclass(frozen=True)
-class Converted:
-    """A state in Flax form.
+class Tensor:
+    """One tensor of a state.
 
     Attributes:
-        variables: `params` and `batch_stats`, nested, for the network that `build` makes.
-        kept: tensors without a place there, by PyTorch name.
+        name, shape: in PyTorch.
+        path: in the Flax variables, None without a place there.
+        spatial: a kernel that keeps its spatial axes; other kernels are linear, or 1x1 convolutions that lose their unit axes.
     """
 
-    variables: dict[str, Any]
-    kept: Arrays
+    name: str
+    shape: tuple[int, ...]
+    path: tuple[str, ...] | None = None
+    spatial: bool = False
 
-    @property
-    def unused(self) -> list[str]:
-        """Names of the parameters and statistics of layers that the released network never uses."""
-        return [name for name in self.kept if name.startswith(UNUSED)]
+    def to_flax(self, value: NDArray) -> NDArray:
+        """Reorder a kernel `[out, in, ...]` to Flax's `[..., in, out]`."""
+        if self.path is None or self.path[-1] != "kernel":
+            return value
+        return np.ascontiguousarray(value.transpose(2, 3, 1, 0) if self.spatial else value.reshape(value.shape[:2]).T)
+
+    def to_torch(self, value: NDArray) -> NDArray:
+        """Undo `to_flax`."""
+        if self.path is None or self.path[-1] != "kernel":
+            return value
+        return np.ascontiguousarray(value.transpose(3, 2, 0, 1) if self.spatial else value.T.reshape(self.shape))
 
 
-def to_flax(state: Mapping[str, NDArray], sizes: Sizes) -> Converted:
-    """Convert a state to Flax variables.
+Layout = Sequence[Tensor]
+
+
+def to_flax(state: State, layout: Layout) -> tuple[dict[str, Any], Arrays]:
+    """Convert a state.
+
+    Returns:
+        The variables, and the tensors without a place in them, by PyTorch name.
 
     Raises:
         ValueError: tensors are missing, surplus or of another shape; all of them are named.
     """
-    shapes = state_shapes(sizes)
-    _raise("this state is not the released network's", _differences({name: np.shape(value) for name, value in state.items()}, shapes))
-    table = {place.name: place for place in places(sizes)}
-    flat = {place.path: place.to_flax(np.asarray(state[name])) for name, place in table.items()}
-    return Converted(traverse_util.unflatten_dict(flat), {name: np.asarray(state[name]) for name in shapes if name not in table})
+    _refuse("this state is not the network's", state, {tensor.name: tensor.shape for tensor in layout})
+    placed = {tensor.path: tensor.to_flax(np.asarray(state[tensor.name])) for tensor in layout if tensor.path}
+    return traverse_util.unflatten_dict(placed), {tensor.name: np.asarray(state[tensor.name]) for tensor in layout if not tensor.path}
 
 
-def to_torch(variables: Mapping[str, Any], sizes: Sizes, kept: Mapping[str, NDArray] | None = None) -> tuple[Arrays, list[str]]:
-    """Convert Flax variables to a state, in the order of the released one.
+def to_torch(variables: Mapping[str, Any], layout: Layout, beside: State) -> tuple[Arrays, list[str]]:
+    """Convert variables.
 
     Args:
-        variables: of the network that `build` makes for the released settings.
-        sizes: of that network.
-        kept: what `to_flax` kept beside the variables; a network that never was a PyTorch one has none.
+        variables: of the network that the layout belongs to.
+        layout: of the state.
+        beside: what `to_flax` returned beside the variables; empty for a network that never was a PyTorch one.
 
     Returns:
-        the state, and the names of the tensors that had to be filled in with zeros (unused parameters, counters).
+        The state, and the names of the tensors that had to be filled with zeros.
 
     Raises:
         ValueError: variables are missing, surplus or of another shape; all of them are named.
     """
-    shapes, kept = state_shapes(sizes), kept or {}
-    table = {place.path: place for place in places(sizes)}
-    flat = {path: np.asarray(value) for path, value in traverse_util.flatten_dict(dict(variables)).items()}
-    expected = {"/".join(path): place.to_flax(np.empty(shapes[place.name], np.bool_)).shape for path, place in table.items()}
-    problems = _differences({"/".join(path): value.shape for path, value in flat.items()}, expected)
-    problems += _differences({name: np.shape(value) for name, value in kept.items()}, {name: shapes.get(name) for name in kept})
-    _raise("these variables are not the released network's", problems)
-    state = {place.name: place.to_torch(flat[path]) for path, place in table.items()}
-    state |= {name: np.asarray(value) for name, value in kept.items()}
-    filled = [name for name in shapes if name not in state]
-    state |= {name: np.zeros(shapes[name], np.int64 if name.endswith("num_batches_tracked") else np.float32) for name in filled}
-    return {name: state[name] for name in shapes}, filled
+    expected = {"/".join(tensor.path): tensor.to_flax(np.empty(tensor.shape, bool)).shape for tensor in layout if tensor.path}
+    expected |= {tensor.name: tensor.shape for tensor in layout if tensor.name in beside and not tensor.path}
+    given = {"/".join(path): value for path, value in traverse_util.flatten_dict(dict(variables)).items()}
+    _refuse("these variables are not the network's", {**given, **beside}, expected)
+    state = {**by_torch_name(variables, layout), **beside}
+    empty = {tensor.name: tensor for tensor in layout if tensor.name not in state}
+    zeros = {name: np.zeros(tensor.shape, np.int64 if name.endswith(COUNTER) else np.float32) for name, tensor in empty.items()}
+    return {tensor.name: (state | zeros)[tensor.name] for tensor in layout}, list(zeros)
 
 
-def by_torch_name(tree: Mapping[str, Any], sizes: Sizes) -> Arrays:
+def by_torch_name(tree: Mapping[str, Any], layout: Layout) -> Arrays:
     """Give the leaves of variables, or of a tree like them (gradients under `params`), PyTorch names and layouts."""
     flat = traverse_util.flatten_dict(dict(tree))
-    return {place.name: place.to_torch(np.asarray(flat[place.path])) for place in places(sizes) if place.path in flat}
+    return {tensor.name: tensor.to_torch(np.asarray(flat[tensor.path])) for tensor in layout if tensor.path in flat}
 
 
-def sizes_of_state(state: Mapping[str, NDArray]) -> Sizes:
-    """Read the sizes off names and shapes; what leaves no trace there (k, K, the number of attention heads) is as released.
-
-    Raises:
-        ValueError: this cannot be the state of such a network.
-    """
-
-    def widths(pattern: str, first: int = 0) -> tuple[int, ...]:
-        """Return the output channels of the series of tensors that `pattern` names, counted up from `first`."""
-        found = []
-        while (value := state.get(pattern.format(first + len(found)))) is not None and np.ndim(value) > 0:
-            found.append(np.shape(value)[0])
-        if not found:
-            raise ValueError(f"this state is not the released network's: missing {pattern.format(first)}")
-        return tuple(found)
-
-    points, image = widths("emb_nn.conv{}.weight", 1), widths("MVCNN.net.{}.0.conv1.weight", 4)
-    return Sizes(
-        widths=points[:-1],
-        dim=points[-1],
-        image_widths=image,
-        image_blocks=tuple(len(widths(f"MVCNN.net.{stage}.{{}}.conv1.weight")) for stage in range(4, 4 + len(image))),
-        feed_forward=widths("attn.model.encoder.layers.0.feed_forward.w_{}.weight", 1)[0],
-        iterations=len(widths("preweight.{}.conv.0.weight")),
-        feature_widths=widths("sim_mat_Fconv.0.conv.{}.conv.weight"),
-        coordinate_widths=widths("sim_mat_Sconv.0.conv.{}.conv.weight"),
-    )
+def named_weights(layout: Layout, seed: int) -> Arrays:
+    """Return the float64 weights of recorded cases: each tensor is a function of its name, its shape and the case's seed."""
+    return {tensor.name: _named_weight(tensor.name, tensor.shape, seed) for tensor in layout}
 
 
-def _differences(shapes: Mapping[str, tuple[int, ...]], expected: Mapping[str, tuple[int, ...] | None]) -> list[str]:
-    problems = [f"missing {name}" for name in expected if name not in shapes]
-    for name, shape in shapes.items():
-        if expected.get(name) is None:
-            problems.append(f"surplus {name}")
-        elif shape != expected[name]:
-            problems.append(f"{name} has shape {shape}, expected {expected[name]}")
-    return problems
+def _named_weight(name: str, shape: tuple[int, ...], seed: int) -> NDArray:
+    kind = name.split(".")[-1]
+    if kind == COUNTER:
+        return np.zeros((), np.int64)
+    if kind == "reflect":
+        return np.diag([1.0, 1.0, -1.0])
+    normal = np.random.default_rng([seed, zlib.crc32(name.encode())]).standard_normal(shape)
+    if kind == "running_var":
+        return 1 + 0.2 * np.abs(normal)
+    if kind in ("running_mean", "bias", "b_2"):
+        return 0.1 * normal
+    if len(shape) == 1:  # scales of norms
+        return 1 + 0.1 * normal
+    return normal * np.sqrt(2.0 / np.prod(shape[1:]))  # He, by fan-in
 
 
-def _raise(what: str, problems: list[str]) -> None:
-    if problems:
-        raise ValueError(f"{what}: {'; '.join(problems)}")
+def _refuse(what: str, arrays: Mapping[str, Any], expected: Mapping[str, tuple[int, ...]]) -> None:
+    found = {name: np.shape(value) for name, value in arrays.items()}
+    faults = [f"missing {name}" for name in expected if name not in found] + [f"surplus {name}" for name in found if name not in expected]
+    faults += [f"{name} has shape {found[name]}, expected {shape}" for name, shape in expected.items() if found.get(name, shape) != shape]
+    if faults:
+        raise ValueError(f"{what}: {'; '.join(faults)}")

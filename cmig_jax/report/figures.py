@@ -19,8 +19,8 @@ from matplotlib.figure import Figure
 from matplotlib.text import Text
 from numpy.typing import ArrayLike, NDArray
 
-from cmig_jax.metrics import RECALL_DEG
-from cmig_jax.report.errors import Errors
+from cmig_jax.evaluation.errors import Errors
+from cmig_jax.evaluation.metrics import RECALL_DEG
 from cmig_jax.report.plots import FAINT, INK, save, style_axes
 
 FLOOR, CEILING = 1e-3, 180.0
@@ -28,7 +28,7 @@ NETWORKS = ("#3179b5", "#d9772b", "#3f9b6c", "#cf5c9e")
 OTHERS = ("#8a8a8a", "#a5764a", "#8e6bbf", "#2a9aa5", "#94892b", "#c94f5d", "#5f7f4f", "#7a86c8")
 """Colours that stand out from white and from black."""
 BINS, FEWEST = 8, 5
-"""Of pairs along the horizontal axis: at most so many bins, each of at least so many pairs."""
+"""Bins of pairs along the horizontal axis: the most bins, and the fewest pairs per bin."""
 
 
 class Drawn(NamedTuple):
@@ -200,7 +200,7 @@ def _line(name: str, errors: Errors) -> dict[str, Any]:
 
 
 def _lowest(values: Iterable[NDArray[np.float64]]) -> float:
-    """Return the power of ten below the smallest error, but for the smallest hundredth: a lucky pair should not stretch the axis."""
+    """Return the power of ten below the smallest 1 % quantile of `values`: a single small error should not stretch the axis."""
     return float(10 ** np.floor(np.log10(min(np.quantile(v, 0.01) for v in values))))
 
 

@@ -1,4 +1,4 @@
-"""The pairs that the report shows: which ones, and what the page holds of each.
+"""The pairs that a report shows: which ones, and their data in the page.
 
 Coordinates are stored as 16-bit integers: a pair has one `scale`, the largest absolute coordinate over 32,767, so that rounding moves
 a coordinate by at most half of it. Arrays are little-endian, row by row, in base64.
@@ -16,19 +16,20 @@ from matplotlib.colors import LinearSegmentedColormap, to_rgb
 from numpy.typing import ArrayLike, NDArray
 from PIL import Image
 
+from cmig_jax.clouds import thinned
 from cmig_jax.data.pairs import Pair
-from cmig_jax.report.errors import Errors
-from cmig_jax.report.matches import Matches
+from cmig_jax.evaluation.errors import Errors
+from cmig_jax.evaluation.matches import Matches
 from cmig_jax.report.plots import DEPTH
 
 LARGEST = 32767
 MAX_POINTS = 8192
 """Points of a cloud that the page holds; a larger one is thinned."""
-SHEET_WIDTH = 1200
-VIEW_SIZE = 96
-SHOWN_SIZE = 64
-GAP = 2
-"""Pixels: of a contact sheet at most, of one of its views at most, of a smaller view as it is shown, and between views."""
+# Pixels.
+SHEET_WIDTH = 1200  # largest width of a contact sheet
+VIEW_SIZE = 96  # largest size of a view in it
+SHOWN_SIZE = 64  # smaller views are enlarged up to this size
+GAP = 2  # between views
 
 
 @dataclass(frozen=True)
@@ -83,7 +84,7 @@ def describe(example: Example, errors: Errors) -> dict[str, Any]:
     pair, matched = example.pair, example.matches
     scale = max(float(np.abs(pair[cloud]).max()) for cloud in ("source", "target")) / LARGEST or 1.0
     described: dict[str, Any] = {"scale": scale}
-    described |= {cloud: quantise(_thinned(pair[cloud]), scale) for cloud in ("source", "target")}
+    described |= {cloud: quantise(thinned(pair[cloud], MAX_POINTS), scale) for cloud in ("source", "target")}
     if matched is not None:
         described["matches"] = {
             "source": quantise(matched.source, scale),
@@ -132,12 +133,6 @@ def _palette() -> list[int]:
     """Return the colours of the depths 0 to 255, as `plots.plot_views` draws them."""
     depths = LinearSegmentedColormap.from_list("depth", DEPTH)(np.linspace(0, 1, 255))[:, :3]
     return (np.concatenate([[to_rgb("white")], depths]) * 255).round().astype(int).ravel().tolist()
-
-
-def _thinned(cloud: NDArray[np.float32]) -> NDArray[np.float32]:
-    if len(cloud) <= MAX_POINTS:
-        return cloud
-    return cloud[np.random.default_rng(0).choice(len(cloud), MAX_POINTS, replace=False)]
 
 
 def _pose(R: NDArray[np.float64], t: NDArray[np.float64]) -> list[float]:

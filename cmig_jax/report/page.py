@@ -17,15 +17,16 @@ from typing import Any
 
 import numpy as np
 
-from cmig_jax.config import Config
-from cmig_jax.data.recordings import SOURCES as RECORDED
-from cmig_jax.metrics import RECALL_CLOSEST_POINT, RECALL_DEG, RECALL_LENGTH
-from cmig_jax.report.errors import Errors
+from cmig_jax.config import Config, ViewsConfig
+from cmig_jax.data.sources import source_of
+from cmig_jax.evaluation.engine import MATCH_DISTANCE
+from cmig_jax.evaluation.errors import Errors
+from cmig_jax.evaluation.metrics import RECALL_CLOSEST_POINT, RECALL_DEG, RECALL_LENGTH
+from cmig_jax.evaluation.tables import html_table
+from cmig_jax.files import write_text
 from cmig_jax.report.figures import Drawn
 from cmig_jax.report.gallery import MAX_POINTS, Example, contact_sheet, describe
 from cmig_jax.report.plots import CORRECT, SOURCE, TARGET, WRONG
-from cmig_jax.report.tables import html_table
-from cmig_jax.training.checkpoint import write_atomically
 
 TRUTH = "#7b6ba8"
 PARTS = Path(__file__).parent
@@ -38,7 +39,7 @@ class Report:
     Attributes:
         run: name of the run.
         checkpoint: which one, and its step.
-        config: the run's flags, with the test data's.
+        config: the network's flags, with those of the test data.
         results: what `evaluate` returned.
         errors: the same, pair by pair.
         examples: the pairs to show, in this order.
@@ -55,7 +56,7 @@ class Report:
 
 
 def write_page(path: Path, report: Report) -> None:
-    """Write the page, under a temporary name first."""
+    """Write the page."""
     page = Template(_part("page.html")).substitute(
         title=escape(f"{report.run}: evaluation"),
         style=_style(),
@@ -70,20 +71,22 @@ def write_page(path: Path, report: Report) -> None:
         data=_embedded({"network": report.errors.network, "pairs": [describe(e, report.errors) for e in report.examples]}),
         script=f"{_part('viewer.js')}\n{_part('page.js')}",
     )
-    write_atomically(path, page)
+    write_text(path, page)
 
 
 def protocol(config: Config, pairs: int) -> str:
     """Describe in one line what the pairs are and how they were made."""
     data, views = config.data, config.views
     shown = "" if views.shown == "real" else f"; views: {views.shown}"
-    kept = data.points if data.crop == "none" else round(data.points * data.keep)
-    if data.source in RECORDED:
-        return f"{data.source}, {pairs} recorded pairs turned by up to {data.max_angle_deg:g}°, {kept} points per cloud{shown}"
+    if source_of(data).records:
+        return (
+            f"{data.source}, {pairs} recorded pairs turned by up to {data.max_angle_deg:g}°, {data.cropped_points} points per cloud{shown}"
+        )
     categories = f"{data.test_categories} categories" + (f" without {', '.join(data.exclude)}" if data.exclude else "")
     crop = "no crop" if data.crop == "none" else f"{data.crop} crop to {data.keep:.0%}"
     noise = f"noise {data.noise_std:g} clipped at {data.noise_clip:g}" if data.noise_std > 0 else "no noise"
-    pose = f"rotations up to {data.max_angle_deg:g}° per axis, translations up to {data.max_translation:g}"
+    turn = " to either side" if data.turn == "either" else ""
+    pose = f"rotations up to {data.max_angle_deg:g}° per axis{turn}, translations up to {data.max_translation:g}"
     return f"{data.source}, {categories}, {pairs} pairs; {data.points} points sampled {data.sampling}, {crop}, {noise}; {pose}{shown}"
 
 
@@ -108,7 +111,7 @@ def _facts(report: Report) -> str:
 
 
 def _reading(config: Config) -> str:
-    frame = "of the recordings' common scale" if config.data.source in RECORDED else "of the normalised object"
+    frame = "of the recordings' common scale" if source_of(config.data).records else "of the normalised object"
     return (
         f"Lengths are in units {frame}. RMSE and MAE compare Euler angles and components of the translation; angle and shift are those "
         f"of the motion between the found and the true pose. Recall: below {RECALL_DEG:g}° and {RECALL_LENGTH:g}; recall (closest): "
@@ -123,11 +126,10 @@ def _methods(errors: Errors) -> str:
 
 
 def _pairs_note(report: Report) -> str:
-    near = report.config.loss.match_threshold
     return (
         f"{len(report.examples)} of {len(report.errors)} pairs, by the rotation error of {report.errors.network}, the largest first. "
-        f"A correspondence is right if it lies within {near:g} under the true pose. Overlap is the share of source points with a target "
-        f"point within {near:g} under the true pose. "
+        f"A correspondence is right if it lies within {MATCH_DISTANCE:g} under the true pose. Overlap is the smaller share of either "
+        f"cloud's points with a point of the other within {MATCH_DISTANCE:g} under the true pose (of recordings: on all their points). "
         f"Coordinates are rounded to 16 bits, clouds thinned to {MAX_POINTS:,} points where they have more."
     )
 
@@ -173,16 +175,22 @@ def _views(example: Example, config: Config) -> str:
     views = example.pair.get("views")
     if views is None:
         return ""
-    names = ["source", "target"] if len(views) == 2 else [config.views.of]
-    of_others = {"real": "", "shuffled": ", here of another pair", "zero": ", here black"}[config.views.shown]
     sheets = []
-    for name, seen in zip(names, views, strict=True):
+    for text, seen in zip(view_titles(config.views), views, strict=True):
         sheet, width = contact_sheet(np.asarray(seen))
         picture = base64.b64encode(sheet).decode()
-        text = f"{len(seen)} depth views of the {name}{of_others}"
         image = f'<img width="{width}" src="data:image/png;base64,{picture}" alt="{escape(text)}">'
         sheets.append(f"<figure>{image}<figcaption>{escape(text)}</figcaption></figure>")
     return f'<div class="views">{"".join(sheets)}</div>'
+
+
+def view_titles(views: ViewsConfig) -> list[str]:
+    """Say of each view set of a pair what it shows."""
+    of = {"object": ["the complete object"], "source": ["the source"], "target": ["the target"], "both": ["the source", "the target"]}
+    if views.shown == "zero":
+        return [f"{views.count} black views in place of depth views of {name}" for name in of[views.of]]
+    shuffled = " of another pair" if views.shown == "shuffled" else ""
+    return [f"{views.count} depth views of {name}{shuffled}" for name in of[views.of]]
 
 
 def _figure(figure: Drawn) -> str:

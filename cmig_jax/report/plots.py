@@ -1,14 +1,11 @@
-"""Pictures: pairs before and after registration, training curves, depth views. NumPy in, PNG (or any suffix matplotlib knows) out.
+"""Pictures of pairs before and after registration, and of depth views: NumPy in, PNG (or any suffix matplotlib knows) out.
 
 Figures are built as objects on the Agg canvas: no display and no global state, so that threads and tests do not disturb each other.
 """
 
 from __future__ import annotations
 
-import json
 import math
-import os
-import re
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any, Literal
@@ -20,24 +17,16 @@ from matplotlib.colors import LinearSegmentedColormap
 from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 from mpl_toolkits.mplot3d.art3d import Line3DCollection
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
+
+from cmig_jax.files import replacing_path
 
 DPI = 150
 INK, FAINT = "#2b2b2b", "#9a9a9a"
 SOURCE, TARGET = "#dd7a2f", "#2c5f8d"
-CORRECT, WRONG, UNKNOWN = "#3f9b6c", "#a3213f", "#8a8a8a"
+CORRECT, WRONG = "#3f9b6c", "#a3213f"
 DEPTH = ("#d3e0e9", "#7fa6c1", "#346a90", "#0f2c44")
-LOSS_COLOURS = {
-    "overlap": "#7b6ba8",
-    "cross_modal": "#b5843c",
-    "mask": "#5b8c85",
-    "matching": "#2c5f8d",
-    "credibility": "#b0566b",
-    "pose": "#6f6f6f",
-}
-ERRORS = {"val_rmse_r_deg": ("RMSE(R)", TARGET), "val_mae_r_deg": ("MAE(R)", SOURCE), "val_iso_r_deg_median": ("median angle", CORRECT)}
 MAX_LINES = 40
-WINDOWS = 200
 
 
 def plot_pairs(pairs: Sequence[Mapping[str, Any]], path: Path, *, up: Literal["x", "y", "z"] = "z") -> None:
@@ -45,7 +34,7 @@ def plot_pairs(pairs: Sequence[Mapping[str, Any]], path: Path, *, up: Literal["x
 
     Args:
         pairs: each with `source` `[N, 3]`, `target` `[M, 3]` and the estimated `R` `[3, 3]`, `t` `[3]`; optionally `title`, and
-            matched keypoints `source_keypoints` `[K, 3]`, `target_keypoints` `[K, 3]` with `correct` `[K]` bool. Where there are more
+            matched keypoints `source_keypoints` `[K, 3]` and `target_keypoints` `[K, 3]` with `correct` `[K]` bool. Where there are more
             than 40 matches, 40 of them are drawn.
         path: the picture.
         up: axis of the data that points upward.
@@ -72,31 +61,6 @@ def plot_pairs(pairs: Sequence[Mapping[str, Any]], path: Path, *, up: Literal["x
             for axes, label in ((before, "before"), (after, "after")):
                 axes.text2D(-0.02, 0.5, label, transform=axes.transAxes, rotation=90, ha="right", va="center", color=INK, fontsize=10)
     _legend(figure, pairs)
-    save(figure, path)
-
-
-def plot_curve(log_path: Path, path: Path) -> None:
-    """Draw the losses and, where the log has them, the validation errors over the steps.
-
-    Args:
-        log_path: JSON lines. A training line has `step`, `loss` and the terms of the losses, whose iterations are added up; a
-            validation line has `step` and `val_rmse_r_deg` (also drawn: `val_mae_r_deg`, `val_iso_r_deg_median`). A last line that an
-            interruption cut short is left out.
-        path: the picture.
-
-    Raises:
-        ValueError: a line that is no JSON object with a step, or no line with a loss; the message names the file.
-    """
-    lines = _read_log(log_path)
-    training = [line for line in lines if "loss" in line]
-    validation = [line for line in lines if any(key in line for key in ERRORS)]
-    if not training:
-        raise ValueError(f"{log_path}: expected at least one line with a loss")
-    figure = Figure(figsize=(10.0 if validation else 5.6, 3.8), layout="constrained")
-    panels = figure.subplots(1, 2 if validation else 1, squeeze=False)[0]
-    _draw_losses(panels[0], training)
-    if validation:
-        _draw_errors(panels[1], validation)
     save(figure, path)
 
 
@@ -132,18 +96,14 @@ def plot_views(views: ArrayLike, path: Path, *, title: str = "") -> None:
 
 
 def save(figure: Figure, path: Path) -> None:
-    """Write a figure on white, in the format of the path's suffix, under a temporary name first."""
+    """Write a figure on white, in the format of the path's suffix."""
     FigureCanvasAgg(figure)
-    temporary = path.with_name(f".{path.stem}.{os.getpid()}{path.suffix}")
-    try:
+    with replacing_path(path) as temporary:
         figure.savefig(temporary, dpi=DPI, facecolor="white")
-        temporary.replace(path)
-    finally:
-        temporary.unlink(missing_ok=True)
 
 
 def style_axes(axes: Axes, xlabel: str, ylabel: str) -> None:
-    """Name the axes, and leave of their frame and grid what reading needs."""
+    """Label the axes, and draw a light frame and grid."""
     axes.set_xlabel(xlabel, color=INK, fontsize=9)
     axes.set_ylabel(ylabel, color=INK, fontsize=9)
     axes.spines[["top", "right"]].set_visible(False)
@@ -176,9 +136,7 @@ def _draw_matches(axes: Any, pair: Mapping[str, Any]) -> None:
     if "source_keypoints" not in pair:
         return
     source, target = np.asarray(pair["source_keypoints"]), np.asarray(pair["target_keypoints"])
-    colours = np.full(len(source), UNKNOWN)
-    if "correct" in pair:
-        colours = np.where(pair["correct"], CORRECT, WRONG)
+    colours = np.where(pair["correct"], CORRECT, WRONG)
     shown = np.linspace(0, len(source) - 1, min(len(source), MAX_LINES)).round().astype(int)
     segments = np.stack([source, target], 1)[shown]
     axes.add_collection3d(Line3DCollection(list(segments), colors=list(colours[shown]), linewidths=0.8, alpha=0.85, zorder=2))
@@ -191,68 +149,7 @@ def _legend(figure: Figure, pairs: Sequence[Mapping[str, Any]]) -> None:
         ("source", SOURCE, {"marker": "o", "ls": "none", "markersize": 5}),
         ("target", TARGET, {"marker": "o", "ls": "none", "markersize": 5}),
     ]
-    if any("correct" in pair for pair in pairs):
+    if any("source_keypoints" in pair for pair in pairs):
         entries += [("right match", CORRECT, {}), ("wrong match", WRONG, {})]
-    elif any("source_keypoints" in pair for pair in pairs):
-        entries += [("match", UNKNOWN, {})]
     handles = [Line2D([], [], color=colour, label=label, **style) for label, colour, style in entries]
     figure.legend(handles=handles, loc="lower center", ncols=len(handles), frameon=False, fontsize=9, labelcolor=INK, borderaxespad=0.2)
-
-
-def _read_log(log_path: Path) -> list[dict[str, Any]]:
-    texts = log_path.read_text(errors="replace").splitlines()
-    lines = []
-    for i, text in enumerate(texts):
-        try:
-            line = json.loads(text)
-            line["step"] = float(line["step"])
-        except (ValueError, TypeError, KeyError) as error:
-            if i == len(texts) - 1 and isinstance(error, json.JSONDecodeError):
-                break
-            raise ValueError(f"{log_path}, line {i + 1}: expected a JSON object with a step, not {text[:80]!r}") from error
-        lines.append(line)
-    return lines
-
-
-def _draw_losses(axes: Axes, lines: Sequence[Mapping[str, Any]]) -> None:
-    steps = np.array([line["step"] for line in lines])
-    terms: dict[str, NDArray[Any]] = {}
-    for key in dict.fromkeys(key for line in lines for key in line):
-        name = re.sub(r"_\d+$", "", key)
-        if name in LOSS_COLOURS:
-            terms[name] = terms.get(name, 0.0) + np.array([line.get(key, np.nan) for line in lines], float)
-    total = np.array([line["loss"] for line in lines], float)
-    windows = [window for window in np.array_split(np.arange(len(steps)), min(len(steps), WINDOWS)) if len(window)]
-    middle = [steps[window].mean() for window in windows]
-    low, high = np.array([np.quantile(total[window], [0.1, 0.9]) for window in windows]).T
-    axes.fill_between(middle, low, high, color=INK, alpha=0.12, linewidth=0)
-    axes.plot(middle, [total[window].mean() for window in windows], color=INK, lw=1.8, label="total")
-    for name in (name for name in LOSS_COLOURS if name in terms):
-        axes.plot(
-            middle, [terms[name][window].mean() for window in windows], color=LOSS_COLOURS[name], lw=1.1, label=name.replace("_", " ")
-        )
-    drawn = np.concatenate([total, *terms.values()])
-    if np.nanmin(drawn) > 0:
-        axes.set_yscale("log")
-    _finish_panel(axes, "loss")
-
-
-def _draw_errors(axes: Axes, lines: Sequence[Mapping[str, Any]]) -> None:
-    for key, (label, colour) in ERRORS.items():
-        found = [(line["step"], line[key]) for line in lines if key in line]
-        if found:
-            steps, values = np.array(found).T
-            axes.plot(steps, values, color=colour, lw=1.6, marker="o", ms=3, label=label)
-            if key == "val_rmse_r_deg" and np.isfinite(values).any():
-                lowest = int(np.nanargmin(values))
-                axes.axhline(values[lowest], color=colour, lw=0.8, ls=":")
-                style: dict[str, Any] = {"textcoords": "offset points", "ha": "left", "va": "top", "color": colour, "fontsize": 8}
-                axes.annotate(f"lowest {values[lowest]:.2f}", (0, values[lowest]), (4, -2), xycoords=("axes fraction", "data"), **style)
-    axes.set_ylim(bottom=0)
-    _finish_panel(axes, "validation error [deg]")
-
-
-def _finish_panel(axes: Axes, ylabel: str) -> None:
-    style_axes(axes, "step", ylabel)
-    axes.grid(visible=False, axis="x")
-    axes.legend(frameon=False, fontsize=8, labelcolor=INK)

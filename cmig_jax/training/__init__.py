@@ -1,1 +1,1 @@
-"""Training: the only room where data, network and losses meet."""
+"""Training: state and step, loop, optimiser, checkpoints, logs, several processes."""

@@ -1,8 +1,9 @@
-"""What a run says while it trains: a progress bar, `log.jsonl`, TensorBoard files."""
+"""Output of a training: a progress bar, `log.jsonl`, TensorBoard files."""
 
 from __future__ import annotations
 
 import json
+import math
 from collections.abc import Mapping
 from pathlib import Path
 from types import TracebackType
@@ -10,17 +11,17 @@ from types import TracebackType
 from tensorboardX import SummaryWriter
 from tqdm import tqdm
 
-from cmig_jax.training.checkpoint import write_atomically
+from cmig_jax.files import write_text
 
 
 class Log:
-    """Logs of a run that stands at `step` of `total`; lines of later steps, which a continued run will write again, are dropped."""
+    """Logs of a run at `step` of `total`; lines of later steps, which a continued run will write again, are dropped."""
 
     def __init__(self, run: Path, step: int, total: int, *, progress: bool) -> None:
         self.path = run / "log.jsonl"
         lines = self.path.read_text().splitlines() if self.path.exists() else []
-        kept = [line for line in lines if _step(line) is not None and _step(line) <= step]  # type: ignore[operator]
-        write_atomically(self.path, "".join(line + "\n" for line in kept))
+        kept = [line for line in lines if _step(line) <= step]
+        write_text(self.path, "".join(line + "\n" for line in kept))
         self._writer = SummaryWriter(str(run / "tensorboard"), purge_step=step + 1)
         self._bar = tqdm(total=total, initial=step, unit="step", disable=not progress, smoothing=0.05, dynamic_ncols=True)
         self._compiled = step == total
@@ -31,7 +32,7 @@ class Log:
         """Move the bar by one step."""
         if not self._compiled:
             self._compiled = True
-            self._bar.unpause()  # the time to compile is not a step's
+            self._bar.unpause()  # the time to compile does not count as a step
         self._bar.set_postfix(loss=f"{loss:.3f}", refresh=False)
         self._bar.update(1)
 
@@ -55,7 +56,7 @@ class Log:
 
 
 class NoLog:
-    """What the processes beside the first one say: nothing."""
+    """The logs of all processes but the first: nothing."""
 
     def advance(self, loss: float) -> None: ...
     def write(self, step: int, values: Mapping[str, float]) -> None: ...
@@ -66,9 +67,9 @@ class NoLog:
     def __exit__(self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None) -> None: ...
 
 
-def _step(line: str) -> int | None:
-    """Read the step of a log line; None for one that was cut off."""
+def _step(line: str) -> float:
+    """Read the step of a log line; infinity for one that was cut off."""
     try:
         return int(json.loads(line)["step"])
     except (ValueError, KeyError, TypeError):
-        return None
+        return math.inf

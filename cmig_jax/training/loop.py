@@ -16,21 +16,21 @@ import jax
 import numpy as np
 from jax.sharding import Mesh
 
-from cmig_jax.compilation import compiled_first
 from cmig_jax.config import Config
 from cmig_jax.data.loader import BatchIterator, epoch_steps, training_batches
 from cmig_jax.data.pairs import Pair, Pairs, in_categories, split_validation
 from cmig_jax.data.prepare import ensure_prepared
-from cmig_jax.data.shards import Shards, check_settings, replacing
-from cmig_jax.metrics import registration_metrics
-from cmig_jax.nn.build import build, uses_images
+from cmig_jax.data.shards import Shards
+from cmig_jax.data.sources import source_of
+from cmig_jax.devices import device_mesh, to_device
+from cmig_jax.evaluation.metrics import registration_metrics
+from cmig_jax.files import remove_partial_files, replacing
+from cmig_jax.inference.predictor import Predictor
 from cmig_jax.training.checkpoint import Checkpoints, check_config, write_config
 from cmig_jax.training.logs import Log, NoLog
-from cmig_jax.training.mesh import device_mesh, to_device
 from cmig_jax.training.optim import optimizer, schedule
-from cmig_jax.training.predict import Predictor
 from cmig_jax.training.processes import StopVote, in_turn, is_first
-from cmig_jax.training.state import Step, TrainState, abstract_state, create_state, make_step
+from cmig_jax.training.state import Step, TrainState, abstract_state, build, create_state, make_step
 
 LOG_EVERY = 10  # steps
 
@@ -59,7 +59,7 @@ def train(config: Config, run: Path, *, resume: bool = False, progress: bool = T
     Args:
         config: the run's flags.
         run: the run folder, which several processes share.
-        resume: continue what is there (or start, if nothing is).
+        resume: continue the run in the folder (or start, if there is none).
         progress: show a bar.
         devices: how many to use (default: the most that share the batch evenly).
 
@@ -80,21 +80,25 @@ def train(config: Config, run: Path, *, resume: bool = False, progress: bool = T
 
 
 def training_data(config: Config) -> TrainingData:
-    """Prepare the objects if need be, and split the training objects of the chosen categories."""
-    if config.data.source == "stanford":
-        raise ValueError("data.source = stanford has no objects to train on: expected another (evaluate.py takes it)")
-    folder = ensure_prepared(config)
-    check_settings(folder, config)
-    objects = Shards(folder, "train")
-    chosen = in_categories(objects.labels, objects.categories, config.data.categories, config.data.exclude)
+    """Prepare the objects if need be, and split the training objects of the chosen categories.
+
+    Raises:
+        ValueError: a source without training objects, too few of them, or fewer points than the network needs.
+    """
+    data, needs = config.data, config.model.needs
+    if not source_of(data).trains:
+        raise ValueError(f"data.source = {data.source} has no objects to train on: expected another (evaluate.py takes it)")
+    if data.cropped_points < needs.training_points:
+        left = f"data.points = {data.points} leaves {data.cropped_points} points after the crop"
+        raise ValueError(f"{left}: expected at least {needs.training_points}, the network's neighbours and keypoints in training")
+    objects = Shards(folder := ensure_prepared(data, config.views), "train")
+    chosen = in_categories(objects.labels, objects.categories, data.categories, data.exclude)
     if len(chosen) < 2:
-        where = f"data.categories={config.data.categories} without data.exclude={config.data.exclude}"
+        where = f"data.categories={data.categories} without data.exclude={data.exclude}"
         raise ValueError(f"{folder}: expected at least 2 training objects in {where}, got {len(chosen)}")
-    train, held = split_validation(chosen, config.data.validation, config.data.test_seed)
-    views = uses_images(config)
-    return TrainingData(
-        train=Pairs(objects, train, config, config.seed, views), validation=Pairs(objects, held, config, config.data.test_seed, views)
-    )
+    train, held = split_validation(chosen, objects.names, data.validation, data.test_seed)
+    views = config.views if needs.views else None
+    return TrainingData(Pairs(objects, train, data, views, config.seed), Pairs(objects, held, data, views, data.test_seed))
 
 
 class _Run:
@@ -104,20 +108,20 @@ class _Run:
         self.total = config.optim.epochs * self.epoch_steps
         self.mesh: Mesh = device_mesh(config.optim.batch, devices)
         self.batches: BatchIterator = training_batches(data.train, config, process=jax.process_index(), processes=jax.process_count())
-        model, rule = build(config), optimizer(config.optim, self.epoch_steps)
-        in_turn(self._write_config)  # now that flags, data and devices fit each other
+        module, rule = build(config), optimizer(config.optim, self.epoch_steps)
+        in_turn(self._open_folder)  # after all checks of flags, data and devices
         self.checkpoints = Checkpoints(folder)
-        restored = self.checkpoints.restore_last(abstract_state(model, rule, config, self.mesh))
+        restored = self.checkpoints.restore_last(abstract_state(module, rule, config, self.mesh))
         if restored is None:
-            self.state: TrainState = create_state(model, rule, config, self.mesh)
+            self.state: TrainState = create_state(module, rule, config, self.mesh)
         else:
             self.state = restored[0]
             if restored[1]:  # a network converted from PyTorch has none
                 self.batches.set_state(restored[1])
         self.step = int(self.state.step)
-        self.update: Step = compiled_first(make_step(model, rule, config, self.mesh))
+        self.update: Step = make_step(module, rule, config, self.mesh)
         self.key = jax.random.key(config.seed)
-        self.predictor = Predictor(model, config.optim.batch, self.mesh)
+        self.predictor = Predictor(module, config.optim.batch, self.mesh)
         self.vote = StopVote(self.mesh)
         self.rate = schedule(config.optim, self.epoch_steps)
         self.pending: tuple[int, dict[str, jax.Array], Pair] | None = None
@@ -131,9 +135,10 @@ class _Run:
             finally:
                 self.checkpoints.close()
 
-    def _write_config(self) -> None:
+    def _open_folder(self) -> None:
         if is_first():
             write_config(self.folder, self.config)
+            remove_partial_files(self.folder)
         elif not (self.folder / "config.json").exists():
             raise ValueError(f"{self.folder}: expected a folder that all processes share, found no config.json of the first one")
 
@@ -144,7 +149,7 @@ class _Run:
             self.state, scalars = self.update(self.state, to_device(arrays, self.mesh), self.key)
             self.step += 1
             stopping = self.vote(stop.is_set())
-            # Read a step's numbers only when the next one is under way, so that an accelerator never waits for the host.
+            # Read a step's numbers only while the next step runs, so that an accelerator never waits for the host.
             self._settle(log)
             self.pending = (self.step, scalars, arrays)
             at_end = self.step == self.total or self.step % every == 0
@@ -156,7 +161,7 @@ class _Run:
                 raise Interrupted(f"stopped at step {self.step} of {self.total}; continue with --resume")
 
     def _settle(self, log: Log | NoLog) -> None:
-        """Check and record the numbers of the last step that was not yet looked at."""
+        """Check and record the numbers of the last step."""
         if self.pending is None:
             return
         step, scalars, arrays = self.pending
@@ -174,8 +179,8 @@ class _Run:
         return {"epoch": step / self.epoch_steps, "learning_rate": float(np.asarray(self.rate(step - 1)))}
 
     def _validate(self, log: Log | NoLog) -> None:
-        found, true = self.predictor.beside_truth(self.state.variables, self.data.validation)
-        measures = {f"val_{name}": value for name, value in registration_metrics(*found, *true).items()}
+        estimated, true = self.predictor.beside_truth(self.state.variables, self.data.validation)
+        measures = {f"val_{name}": value for name, value in registration_metrics(estimated, true).items()}
         log.write(self.step, measures | self._position(self.step))
         epoch = self.step // self.epoch_steps
         log.say(f"epoch {epoch}: validation RMSE(R) {measures['val_rmse_r_deg']:.2f} deg, recall {measures['val_recall']:.2f}")
@@ -187,8 +192,8 @@ class _Run:
     def _check_finite(self, step: int, values: dict[str, float], arrays: Pair) -> None:
         if np.isfinite(list(values.values())).all():
             return
-        share = "" if jax.process_count() == 1 else f"-process-{jax.process_index()}"
-        path = self.folder / f"not-finite-step-{step}{share}.npz"
+        of_process = "" if jax.process_count() == 1 else f"-process-{jax.process_index()}"
+        path = self.folder / f"not-finite-step-{step}{of_process}.npz"
         with replacing(path) as file:
             np.savez(file, **arrays)  # pyright: ignore[reportArgumentType]
         bad = ", ".join(f"{name} = {value}" for name, value in values.items() if not np.isfinite(value))

@@ -1,4 +1,4 @@
-"""Several processes that train as one: how they meet, take turns and agree. Where there is one process, all of this is nothing."""
+"""Several processes that train as one: joining, taking turns, agreeing when to stop. With one process all of it does nothing."""
 
 from __future__ import annotations
 
@@ -11,10 +11,10 @@ import numpy as np
 from jax.experimental import multihost_utils
 from jax.sharding import Mesh
 
-from cmig_jax.training.mesh import replicated, split
+from cmig_jax.devices import replicated, split
 
 T = TypeVar("T")
-PATIENCE_SECONDS = 60  # that a process which ends with an error waits for the others, before JAX ends those
+SHUTDOWN_SECONDS = 60  # how long a process that ends with an error waits for the others before JAX ends them
 
 
 def join(coordinator: str | None = None, processes: int | None = None, process: int | None = None) -> None:
@@ -28,17 +28,17 @@ def join(coordinator: str | None = None, processes: int | None = None, process: 
     Raises:
         ValueError: neither arguments nor a launcher that JAX knows, or a process that is not among `processes`.
     """
-    jax.config.update("jax_enable_preemption_service", False)  # it would keep SIGTERM from the training loop
+    jax.config.update("jax_enable_preemption_service", False)  # it would intercept SIGTERM
     try:
-        jax.distributed.initialize(coordinator, processes, process, shutdown_timeout_seconds=PATIENCE_SECONDS)
+        jax.distributed.initialize(coordinator, processes, process, shutdown_timeout_seconds=SHUTDOWN_SECONDS)
     except ValueError as error:
         given = f"--coordinator {coordinator} --processes {processes} --process {process}"
         raise ValueError(f"{given}: expected HOST:PORT, a count and an index below it, or to be started by a launcher ({error})") from error
-    multihost_utils.sync_global_devices("joined")  # the first meeting on CPUs has 30 seconds; later ones have all the time they need
+    multihost_utils.sync_global_devices("joined")  # on CPUs the first synchronisation has a limit of 30 seconds, later ones have none
 
 
 def is_first() -> bool:
-    """Say whether this is the process that writes and prints."""
+    """Return whether this is the process that writes and prints."""
     return jax.process_index() == 0
 
 
@@ -46,8 +46,8 @@ def in_turn(work: Callable[[], T]) -> T:
     """Do the same work in every process, in the first before the others, which may then find its files.
 
     Raises:
-        ValueError: the work failed in another process; where it raised a ValueError or OSError, that goes on. So none waits for one that
-            has ended.
+        ValueError: the work failed in another process, so that none waits for one that has ended. A ValueError or OSError of this
+            process's own work is raised as it is.
     """
     if jax.process_count() == 1:
         return work()
@@ -63,15 +63,15 @@ def in_turn(work: Callable[[], T]) -> T:
         if error is not None:
             raise error
         if len(failed):
-            raise ValueError(f"process {failed[0]} of {jax.process_count()} could not start, and says why")
+            raise ValueError(f"process {failed[0]} of {jax.process_count()} could not start; its output says why")
     return results[0]
 
 
 class StopVote:
     """Whether any process was asked to stop. All must stop after the same step: in the next, each would wait for the others.
 
-    The votes are counted by the devices behind the step's work and read when the next step is under way, so that the devices wait for
-    nobody. One process alone decides at once.
+    The devices count the votes after the step's work, and the host reads them while the next step runs, so that devices never wait for
+    the host. A single process decides at once.
     """
 
     def __init__(self, mesh: Mesh) -> None:

@@ -1,10 +1,11 @@
-"""What training changes, and the step that changes it."""
+"""The state of a training, and the step that changes it."""
 
 from __future__ import annotations
 
 from collections.abc import Callable
 from typing import Any
 
+import flax.linen as nn
 import jax
 import jax.numpy as jnp
 import optax
@@ -12,21 +13,21 @@ from flax import struct
 from jax import Array
 from jax.sharding import Mesh
 
-from cmig_jax.compilation import briefly, frugal
+from cmig_jax.compilation import compile_quickly, less_memory
 from cmig_jax.config import Config
-from cmig_jax.losses import losses
-from cmig_jax.nn.cmignet import CMIGNet
-from cmig_jax.structs import Batch, Prediction, RigidTransform
-from cmig_jax.training.mesh import replicated, sharing, split
+from cmig_jax.devices import replicated, sharing, split
+from cmig_jax.models.base import initial_variables
+from cmig_jax.models.networks import model_of
+from cmig_jax.structs import Batch
 
 Step = Callable[["TrainState", Batch, Array], tuple["TrainState", dict[str, Array]]]
 
 
 @struct.dataclass
 class TrainState:
-    """Everything a run needs to go on: the step's number, parameters, running statistics, Adam's moments.
+    """What a run needs to continue: the step's number, parameters, running statistics, Adam's moments.
 
-    Random keys are functions of the run's seed and the step, so they need no place here.
+    Random keys are functions of the run's seed and the step, so they are not stored.
     """
 
     step: Array
@@ -40,21 +41,26 @@ class TrainState:
         return {"params": self.params, "batch_stats": self.batch_stats}
 
 
-def create_state(model: CMIGNet, optimizer: optax.GradientTransformation, config: Config, mesh: Mesh) -> TrainState:
+def build(config: Config) -> nn.Module:
+    """Build the network of a config."""
+    return model_of(config.model).build(config.model, config.compute)
+
+
+def create_state(module: nn.Module, optimizer: optax.GradientTransformation, config: Config, mesh: Mesh) -> TrainState:
     """Initialise a state on every device of the mesh."""
     # Under jit with the sharding of the result: a device_put could alias arrays that the step donates.
-    create = jax.jit(lambda key: _initial(model, optimizer, config, key), out_shardings=replicated(mesh), compiler_options=briefly())
-    return create(jax.random.key(config.seed))
+    options: dict[str, Any] = {"out_shardings": replicated(mesh), "compiler_options": compile_quickly()}
+    return jax.jit(lambda key: _initial(module, optimizer, config, key), **options)(jax.random.key(config.seed))
 
 
-def abstract_state(model: CMIGNet, optimizer: optax.GradientTransformation, config: Config, mesh: Mesh) -> TrainState:
+def abstract_state(module: nn.Module, optimizer: optax.GradientTransformation, config: Config, mesh: Mesh) -> TrainState:
     """Describe the state by shapes, types and placement, without making it."""
-    shapes = jax.eval_shape(lambda key: _initial(model, optimizer, config, key), jax.random.key(config.seed))
+    shapes = jax.eval_shape(lambda key: _initial(module, optimizer, config, key), jax.random.key(config.seed))
     return jax.tree.map(lambda x: jax.ShapeDtypeStruct(x.shape, x.dtype, sharding=replicated(mesh)), shapes)
 
 
-def _initial(model: CMIGNet, optimizer: optax.GradientTransformation, config: Config, key: Array) -> TrainState:
-    variables = model.init(key, smallest_batch(config), train=True, key=key)
+def state_of(variables: dict[str, Any], optimizer: optax.GradientTransformation) -> TrainState:
+    """Return the state of a run that starts from some variables."""
     return TrainState(
         step=jnp.zeros((), jnp.int32),
         params=variables["params"],
@@ -63,33 +69,24 @@ def _initial(model: CMIGNet, optimizer: optax.GradientTransformation, config: Co
     )
 
 
-def smallest_batch(config: Config) -> Batch:
-    """Return the smallest batch that the network takes; parameters do not depend on numbers of pairs, points or pixels."""
-    points = max(config.model.points.k, config.model.keypoints.count)
-    sets = 2 if config.views.of == "both" else 1
-    return Batch(
-        source=jnp.zeros((1, points, 3)),
-        target=jnp.zeros((1, points, 3)),
-        views=jnp.zeros((1, sets, 1, 32, 32, 1), jnp.uint8),
-        target_from_source=RigidTransform.identity((1,)),
-    )
+def _initial(module: nn.Module, optimizer: optax.GradientTransformation, config: Config, key: Array) -> TrainState:
+    return state_of(initial_variables(module, config.model.needs, key), optimizer)
 
 
-def make_step(model: CMIGNet, optimizer: optax.GradientTransformation, config: Config, mesh: Mesh) -> Step:
-    """Compile-once training step for one global batch: (state, batch, the run's random key) -> (state, scalars).
+def make_step(module: nn.Module, optimizer: optax.GradientTransformation, config: Config, mesh: Mesh) -> Step:
+    """Make the training step for one global batch: (state, batch, the run's random key) -> (state, scalars).
 
     The key is an argument, so that runs that differ in their seed share a compiled step. The state is donated. The scalars are the
-    total `loss`, every loss term and `gradient_norm`; where they are not finite the state is returned unchanged but for its step, so
+    total `loss`, every loss term and `gradient_norm`; if they are not finite, the state is returned unchanged except for its step, so
     that it can be inspected.
     """
+    model = model_of(config.model)
 
     def loss_function(params: Any, state: TrainState, batch: Batch, key: Array) -> tuple[Array, tuple[dict[str, Array], Any]]:
-        prediction, updates = model.apply(
-            {"params": params, "batch_stats": state.batch_stats}, batch, train=True, key=key, mutable=["batch_stats"]
-        )
-        assert isinstance(prediction, Prediction)
-        terms = losses(prediction, batch, config.loss)
-        return jnp.sum(jnp.stack(list(terms.values()))), (terms, updates["batch_stats"])
+        variables = {"params": params, "batch_stats": state.batch_stats}
+        prediction, updates = module.apply(variables, batch, train=True, key=key, mutable=["batch_stats"])
+        terms = model.losses(prediction, batch, config.model, config.compute)
+        return jnp.sum(jnp.stack(list(terms.values()))), (terms, updates.get("batch_stats", {}))
 
     def step(state: TrainState, batch: Batch, key: Array) -> tuple[TrainState, dict[str, Array]]:
         key = jax.random.fold_in(key, state.step)
@@ -105,4 +102,4 @@ def make_step(model: CMIGNet, optimizer: optax.GradientTransformation, config: C
         return kept.replace(step=state.step + 1), {"loss": loss, **terms, "gradient_norm": norm}
 
     shardings = {"in_shardings": (replicated(mesh), split(mesh), None), "out_shardings": replicated(mesh)}
-    return jax.jit(step, donate_argnums=0, compiler_options=frugal(), **shardings)
+    return jax.jit(step, donate_argnums=0, compiler_options=less_memory(), **shardings)

@@ -7,15 +7,17 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from cmig_jax.config import Config, DataConfig, KeypointsConfig, LossConfig, ModelConfig, OptimConfig, ViewsConfig
+from cmig_jax.config import Config, DataConfig, OptimConfig, ViewsConfig
 from cmig_jax.data.loader import epoch_steps, stack, training_batches
 from cmig_jax.data.pairs import Pairs
+from cmig_jax.models.cmignet.flags import CMIGNetFlags
 
 
 class Objects:
     """Ten clouds, each near its own number."""
 
     labels = np.zeros(10, np.int32)
+    names = tuple(f"thing {i}" for i in range(10))
     categories = ("thing",)
 
     def points(self, i):
@@ -26,17 +28,11 @@ class Objects:
 
 
 def config(batch=4, seed=0):
-    return Config(
-        seed=seed,
-        data=DataConfig(points=40),
-        views=ViewsConfig(count=6, size=8, layout="axes"),
-        model=ModelConfig(keypoints=KeypointsConfig(count=16)),
-        loss=LossConfig(cross_modal="nt-xent"),
-        optim=OptimConfig(batch=batch),
-    )
+    data, views = DataConfig(points=40), ViewsConfig(count=6, size=8, layout="axes")
+    return Config(name="loader", model=CMIGNetFlags(), seed=seed, data=data, views=views, optim=OptimConfig(batch=batch))
 
 
-PAIRS = Pairs(Objects(), np.arange(10), config(), seed=99)
+PAIRS = Pairs(Objects(), np.arange(10), config().data, config().views, seed=99)
 
 
 def take(count, start=0, **process):
@@ -124,7 +120,7 @@ def test_batches_that_cannot_be_made_are_refused():
 
 
 def test_pairs_without_views_stack_without_them():
-    pairs = Pairs(Objects(), np.arange(10), config(), seed=0, views=False)
+    pairs = Pairs(Objects(), np.arange(10), config().data, None, seed=0)
     assert set(stack([pairs[0], pairs[1]])) == {"source", "target", "R", "t"}
 
 

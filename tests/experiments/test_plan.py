@@ -6,17 +6,18 @@ from pathlib import Path
 import pytest
 import tyro
 
-import train
+from cmig_jax.commands import train
 from cmig_jax.config import Config
 from cmig_jax.experiments.plan import changes, command_line, plan, run_name, with_flags
 from configs import PRESETS
+from configs.catalogue import catalogue
 from configs.experiments import AT_TEST, CORRECTIONS, EXPERIMENTS
 
-ROOTS = dict.fromkeys(("modelnet40-hdf5", "stanford", "stanford-scans", "sevenscenes", "sevenscenes-fragments"), "DIR")
+ROOTS = dict.fromkeys(("data", "stanford", "sevenscenes"), "DIR")
 
 
 def jobs(name, scale="cpu", seeds=(0,)):
-    return plan(EXPERIMENTS[name], scale=scale, roots=ROOTS, source="modelnet40-hdf5", seeds=seeds, runs=Path("runs"))
+    return plan(EXPERIMENTS[name], catalogue(), scale=scale, roots=ROOTS, source="modelnet40-hdf5", seeds=seeds, runs=Path("runs"))
 
 
 def test_every_table_and_figure_of_the_paper_is_there():
@@ -50,7 +51,7 @@ def test_the_printed_command_trains_the_same_config(name, scale):
     for job in jobs(name, scale, seeds=(3,)):
         words = shlex.split(job.commands()[0])
         assert words[:2] == ["python", "train.py"]
-        command = train.parse(words[2:])
+        command = train.parse(words[2:], "train.py", catalogue)
         assert command.config == job.training
         assert command.runs / command.config.name == job.run
 
@@ -77,9 +78,9 @@ def test_rows_that_are_tested_differently_have_different_results():
     assert real.run == shuffled.run == zero.run
     assert len({real.evaluation, shuffled.evaluation, zero.evaluation}) == 3
     assert jobs("corrections")[0].evaluation == real.evaluation
-    alone, finished = (next(job for job in jobs("scans") if job.row.label == label) for label in ("corrected", "corrected, then ICP"))
-    assert (alone.run, alone.test) == (finished.run, finished.test)
-    assert alone.evaluation != finished.evaluation
+    alone, refined = (next(job for job in jobs("scans") if job.row.label == label) for label in ("corrected", "corrected, then ICP"))
+    assert (alone.run, alone.test) == (refined.run, refined.test)
+    assert alone.evaluation != refined.evaluation
 
 
 def test_corrected_is_released_with_the_corrections_that_help():
@@ -93,14 +94,15 @@ def test_corrected_is_released_with_the_corrections_that_help():
 def test_a_flag_that_is_none_is_an_error():
     for flag in ("model.matching.iteration", "model.matching", "speed", "data.points.k"):
         with pytest.raises(ValueError, match="expected the name of a flag"):
-            with_flags(Config(), {flag: 3})
+            with_flags(PRESETS["paper"](), {flag: 3})
     with pytest.raises(ValueError, match=r"config\.views\.of = 'all': expected one of"):
-        with_flags(Config(), {"views.of": "all"})
+        with_flags(PRESETS["paper"](), {"views.of": "all"})
 
 
 def test_names_and_command_lines():
     flags = {"model.keypoints.score_from": "other", "data.exclude": ("cup", "vase")}
     assert run_name("paper", flags, 2) == "paper+data.exclude=cup,vase+model.keypoints.score_from=other+seed=2"
     assert list(command_line(flags)) == ["--model.keypoints.score-from", "other", "--data.exclude", "cup", "vase"]
-    parsed = tyro.cli(Config, args=list(command_line(flags)), config=(tyro.conf.ConsolidateSubcommandArgs,))
-    assert changes(Config(), parsed) == flags
+    preset = PRESETS["paper"]()
+    parsed = tyro.cli(Config, default=preset, args=list(command_line(flags)), config=(tyro.conf.ConsolidateSubcommandArgs,))
+    assert changes(preset, parsed) == flags

@@ -7,11 +7,12 @@ from pathlib import Path
 import jax
 import pytest
 
+from cmig_jax.devices import device_mesh
 from cmig_jax.experiments.plan import plan, run_name, with_flags
-from cmig_jax.nn.build import build
-from cmig_jax.training.mesh import device_mesh
+from cmig_jax.models.base import predict, smallest_batch
 from cmig_jax.training.optim import optimizer
-from cmig_jax.training.state import abstract_state, make_step, smallest_batch
+from cmig_jax.training.state import abstract_state, build, make_step
+from configs.catalogue import catalogue
 from configs.experiments import EXPERIMENTS
 
 COMPUTED_ALIKE = ("data.", "views.shown")
@@ -22,7 +23,7 @@ def distinct(*, tested):
     """List one job for each thing to compute, in training or test, named by what it changes."""
     found = {}
     for experiment in EXPERIMENTS.values():
-        for job in plan(experiment, scale="toy", roots={}, source="shapes", seeds=(0,), runs=Path("runs")):
+        for job in plan(experiment, catalogue(), scale="toy", roots={}, source="shapes", seeds=(0,), runs=Path("runs")):
             flags = {**job.row.flags, **(job.row.test if tested else {})}
             if "model.matching.iterations" not in flags:  # one is traced in a third of the time of three
                 once = {"model.matching.iterations": 1}
@@ -39,7 +40,7 @@ TRAININGS, TESTS = distinct(tested=False), distinct(tested=True)
 def described(config):
     """Describe the mesh, the state and the smallest batch of a training."""
     mesh, rule = device_mesh(1), optimizer(config.optim, 1)
-    return mesh, rule, abstract_state(build(config), rule, config, mesh), jax.eval_shape(lambda: smallest_batch(config))
+    return mesh, rule, abstract_state(build(config), rule, config, mesh), jax.eval_shape(lambda: smallest_batch(config.model.needs))
 
 
 def test_all_presets_and_heads_are_among_them():
@@ -62,6 +63,6 @@ def test_a_row_predicts(name):
     job = TESTS[name]
     *_, state, _ = described(job.training)
     shown = with_flags(job.test, {"model.keypoints.test_count": 0})  # the smallest batch has no more points than that
-    batch = jax.eval_shape(lambda: smallest_batch(shown)).replace(target_from_source=None)
-    predicted = jax.eval_shape(lambda v, b: build(shown).apply(v, b, train=False), state.variables, batch)
+    batch = jax.eval_shape(lambda: smallest_batch(shown.model.needs)).replace(target_from_source=None)
+    predicted = jax.eval_shape(lambda v, b: predict(build(shown), v, b), state.variables, batch)
     assert len(predicted.iterations) == job.test.model.matching.iterations + job.test.model.matching.repeats

@@ -6,15 +6,21 @@ import shutil
 from dataclasses import replace
 
 import h5py
+import jax
 import numpy as np
 import pytest
 
-from cmig_jax.data.pairs import SYMMETRIC
-from cmig_jax.experiments.__main__ import main
+from cmig_jax import cli
+from cmig_jax.data.protocol import SYMMETRIC
+from configs.catalogue import catalogue
 from configs.experiments import EXPERIMENTS, NOISE, OBSERVED, Experiment, Row
 
-SHORT = {"model.fusion.image": "none", "loss.cross_modal": "off", "model.matching.iterations": 1}
+SHORT = {"model.fusion.image": "none", "model.loss.cross_modal": "off", "model.matching.iterations": 1}
 CATEGORIES = (*SYMMETRIC, "chair", "desk", "door", "sofa")
+
+
+def main(arguments):
+    return cli.main(["experiments", *arguments], catalogue)
 
 
 @pytest.fixture(scope="session")
@@ -80,7 +86,7 @@ def test_an_experiment_runs_from_end_to_end(name, run, tmp_path, capsys):
 
 
 def test_recorded_pairs_and_methods_without_learning_by_a_network_that_another_table_trained(short, run, monkeypatch, capsys):
-    regression, test = {"model.matching.head": "pcrnet", **SHORT}, {"data.source": "stanford-scans"} | OBSERVED
+    regression, test = {**EXPERIMENTS["table8"].rows[0].flags, **SHORT}, {"data.source": "stanford-scans"} | OBSERVED
     rows = (Row("PCRNet", "paper", regression, test), Row("PCRNet, then GICP", "paper", regression, test, then="GICP"))
     monkeypatch.setitem(EXPERIMENTS, "recorded", Experiment("range scans", NOISE, rows, baselines=True))
     logs = {path: path.read_bytes() for path in short.glob("runs/toy/*/log.jsonl")}
@@ -113,6 +119,14 @@ def test_what_is_finished_is_not_done_again_and_what_is_missing_is(short, run, t
     assert json.loads((folder / "short.json").read_text())["rows"] == again["rows"]
 
 
+def test_damaged_results_are_named(short, run, tmp_path, capsys):
+    shutil.copytree(short, tmp_path, dirs_exist_ok=True)
+    for path in (tmp_path / "runs" / "toy").glob("*pcrnet*/*/results.json"):
+        path.write_text("{")
+    assert run(tmp_path, "short", "--limit", 3) == 1
+    assert "results.json: not readable" in capsys.readouterr().out
+
+
 def test_data_that_is_not_given_leaves_a_row_empty_and_a_failure_is_shown(tmp_path, objects, monkeypatch, capsys):
     monkeypatch.chdir(tmp_path)
     places = ["--scale", "toy", "--runs", str(tmp_path / "runs")]
@@ -134,3 +148,12 @@ def test_an_unknown_experiment_is_an_error_and_the_list_has_all(capsys):
     printed = capsys.readouterr().out
     assert all(f"{name}: {experiment.about}" in printed for name, experiment in EXPERIMENTS.items())
     assert "model.matching.iterations=5" in printed
+
+
+def test_a_row_that_runs_out_of_memory_does_not_stop_the_others(tmp_path, objects, monkeypatch, capsys):
+    def train(*_, **__):
+        raise jax.errors.JaxRuntimeError("RESOURCE_EXHAUSTED")
+
+    monkeypatch.setattr("cmig_jax.experiments.run.train", train)
+    assert main(["run", "table8", "--data", str(objects), "--scale", "toy", "--runs", str(tmp_path / "runs")]) == 1
+    assert capsys.readouterr().out.count("  failed: RESOURCE_EXHAUSTED") == 3

@@ -9,6 +9,7 @@ from cmig_jax.experiments.figure import plot_rows
 from cmig_jax.experiments.plan import plan
 from cmig_jax.experiments.run import Outcome, Results
 from cmig_jax.experiments.table import as_json, notes, spread, table
+from configs.catalogue import catalogue
 from configs.experiments import EXPERIMENTS
 
 TABLE7 = EXPERIMENTS["table7"]
@@ -21,7 +22,7 @@ def metrics(rmse):
 
 @pytest.fixture
 def results():
-    jobs = plan(TABLE7, scale="cpu", roots={}, source="shapes", seeds=(0, 1), runs=Path("runs"))
+    jobs = plan(TABLE7, catalogue(), scale="cpu", roots={}, source="shapes", seeds=(0, 1), runs=Path("runs"))
     found = [Outcome(job, problem="failed: no such file") for job in jobs]
     found[0], found[1] = Outcome(jobs[0], metrics(1.0)), Outcome(jobs[1], metrics(3.0))
     found[2], found[3] = Outcome(jobs[2], metrics(7.25)), Outcome(jobs[3], problem="not run")

@@ -43,25 +43,14 @@ def edge_by_edge(variables, clouds, neighbours, train):
     return tuple(outputs), stats
 
 
-def random_variables(rng, inputs, features):
-    """Scales of both signs, and statistics far from where they start."""
-    return {
-        "params": {
-            "kernel": rng.normal(size=(2 * inputs, features)),
-            "norm": {"scale": rng.normal(size=features), "bias": rng.normal(size=features)},
-        },
-        "batch_stats": {"norm": {"mean": rng.normal(size=features), "var": rng.uniform(0.5, 2, features)}},
-    }
-
-
 @pytest.fixture
-def case():
-    """Make two clouds of different size, away from the origin."""
-    rng = np.random.default_rng(0)
-    clouds = tuple(rng.normal(size=(2, n, C)) + 3 for n in (11, 14))
-    variables = random_variables(rng, C, WIDTH)
-    assert np.min(variables["params"]["norm"]["scale"]) < 0 < np.max(variables["params"]["norm"]["scale"])
-    return variables, clouds, tuple(knn(x, K) for x in clouds)
+def case(random_variables):
+    """Return two clouds of different size, away from the origin, their neighbours, and variables with scales of both signs."""
+    clouds = tuple(np.random.default_rng(n).normal(size=(2, n, C)) + 3 for n in (11, 14))
+    neighbours = tuple(knn(x, K) for x in clouds)
+    variables = random_variables(EdgeConv(WIDTH), clouds, neighbours, train=False)
+    variables["params"]["norm"]["scale"][::2] *= -1
+    return variables, clouds, neighbours
 
 
 @functools.partial(jax.jit, static_argnums=3)
@@ -77,31 +66,24 @@ def assert_same(a, b, atol=1e-10):
 
 
 @pytest.mark.parametrize("train", [True, False])
-def test_values_and_running_statistics_equal_the_edge_by_edge_layer(case, train):
-    outputs = layer(*case, train)
-    assert {x.dtype for x in jax.tree.leaves(outputs)} == {jnp.dtype("float64")}
-    assert_same(outputs, edge_by_edge(*case, train))
-
-
-@pytest.mark.parametrize("train", [True, False])
-def test_gradients_equal_the_edge_by_edge_layers(case, train):
+def test_values_statistics_and_gradients_equal_the_edge_by_edge_layer(case, train):
     variables, clouds, neighbours = case
-    rng = np.random.default_rng(1)
-    cotangents = [rng.normal(size=(*x.shape[:2], WIDTH)) for x in clouds]
+    cotangents = [np.random.default_rng(1).normal(size=(*x.shape[:2], WIDTH)) for x in clouds]
 
-    def gradients(function):
+    def results(function):
         def total(params, clouds):
-            outputs, _ = function({**variables, "params": params}, clouds, neighbours, train)
-            return sum(jnp.sum(c * y) for c, y in zip(cotangents, outputs, strict=True))
+            outputs, stats = function({**variables, "params": params}, clouds, neighbours, train)
+            return sum(jnp.sum(c * y) for c, y in zip(cotangents, outputs, strict=True)), (outputs, stats)
 
-        return jax.jit(jax.grad(total, argnums=(0, 1)))(variables["params"], clouds)
+        return jax.jit(jax.grad(total, argnums=(0, 1), has_aux=True))(variables["params"], clouds)
 
-    assert_same(gradients(layer), gradients(edge_by_edge), atol=1e-9)
+    found = results(layer)
+    assert {x.dtype for x in jax.tree.leaves(found)} == {jnp.dtype("float64")}
+    assert_same(found, results(edge_by_edge), atol=1e-9)
 
 
-def test_coincident_points_have_finite_gradients():
-    clouds, neighbours = (np.ones((1, 6, C)),), (np.broadcast_to(np.arange(K), (1, 6, K)),)
-    variables = random_variables(np.random.default_rng(2), C, WIDTH)
+def test_coincident_points_have_finite_gradients(case):
+    clouds, neighbours, variables = (np.ones((1, 6, C)),), (np.broadcast_to(np.arange(K), (1, 6, K)),), case[0]
 
     def total(params, clouds):
         return jnp.sum(layer({**variables, "params": params}, clouds, neighbours, True)[0][0] ** 2)
@@ -110,21 +92,10 @@ def test_coincident_points_have_finite_gradients():
 
 
 @pytest.fixture
-def encoder():
-    rng = np.random.default_rng(3)
-    clouds = tuple(rng.normal(size=(2, 12, 3)) for _ in range(2))
+def encoder(random_variables):
+    clouds = tuple(np.random.default_rng(seed).normal(size=(2, 12, 3)) for seed in (3, 4))
     net = PointEncoder(k=K, widths=(6, 7), dim=9)
-    variables = {
-        "params": {
-            "last": {"kernel": rng.normal(size=(3 + 6 + 7, 9))},
-            "last_norm": {"scale": rng.normal(size=9), "bias": rng.normal(size=9)},
-        },
-        "batch_stats": {"last_norm": {"mean": rng.normal(size=9), "var": rng.uniform(0.5, 2, 9)}},
-    }
-    for i, (inputs, width) in enumerate(((3, 6), (9, 7))):
-        for kind, value in random_variables(rng, inputs, width).items():
-            variables[kind][f"edge_{i}"] = value
-    return net, variables, clouds
+    return net, random_variables(net, clouds, train=False), clouds
 
 
 @functools.partial(jax.jit, static_argnums=0)
@@ -160,11 +131,9 @@ def test_two_clouds_are_encoded_as_one_batch(encoder):
     assert_same(stats, joint)
 
 
-def test_chunks_of_rows_and_the_order_of_points_change_nothing(encoder):
+def test_the_order_of_points_is_the_order_of_the_features(encoder):
     net, variables, clouds = encoder
-    (whole,) = evaluate(net, variables, clouds[:1])
-    (chunked,) = evaluate(net.clone(rows=5), variables, clouds[:1])
-    assert_same(whole, chunked)
+    (features,) = evaluate(net, variables, clouds[:1])
     order = np.random.default_rng(4).permutation(12)
     (permuted,) = evaluate(net, variables, (clouds[0][:, order],))
-    assert_same(whole[:, order], permuted)
+    assert_same(features[:, order], permuted)

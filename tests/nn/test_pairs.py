@@ -1,139 +1,61 @@
-"""Networks over pairs in chunks equal the plain layers on all pairs at once: values, gradients and batch statistics."""
+"""The first layer over pairs: against its formula, where points nearly coincide, and the digits of its statistics."""
 
-import functools
-
-import flax.linen as nn
 import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from cmig_jax.nn.mlp import Dense, NormedMLP
-from cmig_jax.nn.norm import BatchNorm, moments
-from cmig_jax.nn.pairs import PairSum, PairTerm
-from cmig_jax.nn.tower import Tower, chunks_of, joined, sweep
-
-WIDTHS = (6, 5, 4)
-
-
-@pytest.fixture(autouse=True)
-def float64():
-    with jax.enable_x64(True):
-        yield
+from cmig_jax.nn.pairs import PairLayer
+from cmig_jax.ops.moments import moments
+from cmig_jax.ops.pairs import fast_moments, plain_values
 
 
 def normal(*shape, seed=0):
     return np.random.default_rng(seed).normal(size=shape)
 
 
-def pair_sum(offset=0.0, dtype=np.float64):
-    """Draw sums over 8 x 7 pairs whose terms have large means."""
-    length = PairTerm(normal(2, 8, 7, seed=1) + offset, None, normal(1, 1, 6, seed=2))
-    direction = PairTerm(normal(2, 8, 7, seed=4) + offset, normal(2, 8, 6, seed=5), normal(2, 7, 6, seed=6))
-    whole = PairSum(normal(2, 8, 6, seed=7) + offset, (length, direction))
-    return jax.tree.map(lambda x: x.astype(dtype), whole)
+def first_layer(layer, kernel, *inputs):
+    """Return the layer's value at every pair, `[B, N, M, features]`."""
+    return plain_values(layer.apply({"params": {"kernel": kernel}}, *inputs))
 
 
-@pytest.mark.parametrize("rows", [3, 40])  # few are added one by one, many by a product
-def test_the_derivative_of_the_values_is_that_of_their_formula(rows):
-    def formula(row, length, direction):
-        direction = direction.scale[..., None] * (direction.row[:, :, None] + direction.column[:, None])
-        return row[:, :, None] + length.scale[..., None] * length.column[:, None] + direction
-
-    row, cotangent = normal(2, rows, 6), normal(2, rows, 7, 6, seed=1)
-    length = PairTerm(normal(2, rows, 7, seed=2), None, normal(1, 1, 6, seed=3))
-    direction = PairTerm(normal(2, rows, 7, seed=4), normal(2, rows, 6, seed=5), normal(2, 7, 6, seed=6))
-    ours = jax.jit(jax.grad(lambda p: jnp.sum(cotangent * p.values())))(PairSum(row, (length, direction)))
-    plain = jax.jit(jax.grad(lambda p: jnp.sum(cotangent * formula(p.row, *p.terms))))(PairSum(row, (length, direction)))
-    jax.tree.map(lambda x, y: np.testing.assert_allclose(x, y, atol=1e-12), ours, plain)
+@pytest.mark.parametrize("reverse", [False, True])
+@pytest.mark.parametrize("C", [3, 4])
+def test_a_pair_layer_is_the_matrix_on_length_direction_and_row_numbers(C, reverse):
+    a, b, extra, kernel = normal(2, 5, C), normal(2, 6, C, seed=1) + 3, normal(2, 5, 2, seed=2), normal(3 + C, 8, seed=3)
+    difference = b[:, None] - a[:, :, None]
+    length = np.linalg.norm(difference, axis=-1, keepdims=True)
+    direction = (-difference if reverse else difference) / (length + 1e-8)
+    inputs = np.concatenate([length, direction, np.broadcast_to(extra[:, :, None], (2, 5, 6, 2))], -1)
+    with jax.enable_x64(True):
+        np.testing.assert_allclose(first_layer(PairLayer(8, reverse=reverse), kernel, a, b, extra), inputs @ kernel, atol=1e-12)
 
 
-class Plain(nn.Module):
-    """The tower on a tensor of all pairs."""
-
-    @nn.compact
-    def __call__(self, pairs, *, train):
-        hidden = nn.relu(BatchNorm(WIDTHS[0], name="first_norm")(pairs.values(), train=train))
-        hidden = NormedMLP(WIDTHS[1:], name="hidden")(hidden, train=train)
-        return Dense(1, name="last")(hidden)[..., 0], jnp.max(hidden, axis=-2)
+@pytest.mark.parametrize("C", [3, 32])
+def test_coincident_points_have_finite_gradients_in_float32(C):
+    a = normal(1, 6, C).astype(np.float32) + 1
+    kernel = normal(1 + C, 2).astype(np.float32)
+    gradient = jax.jit(jax.grad(lambda a: jnp.sum(first_layer(PairLayer(2), kernel, a, a) ** 2)))(a)
+    assert np.all(np.isfinite(gradient))
 
 
-@functools.partial(jax.jit, static_argnums=(0, 3))
-def value_and_gradients(layer, variables, pairs, train):
-    def total(params, pairs):
-        outputs, state = layer.apply({**variables, "params": params}, pairs, train=train, mutable=["batch_stats"])
-        return sum(jnp.sum(jnp.sin(x + jnp.arange(x.size).reshape(x.shape))) for x in outputs), (outputs, state)
-
-    return jax.value_and_grad(total, argnums=(0, 1), has_aux=True)(variables["params"], pairs)
-
-
-@pytest.mark.parametrize("train", [False, True])
-@pytest.mark.parametrize("rows", [0, 1, 3, 4])
-def test_a_tower_in_chunks_is_the_plain_tower(rows, train, random_like):
-    pairs = pair_sum()
-    shapes = jax.eval_shape(functools.partial(Plain().init, train=False), jax.random.key(0), pairs)
-    variables = random_like(shapes, dtype=np.float64)
-    ours = value_and_gradients(Tower(WIDTHS, rows=rows, pooled=True), variables, pairs, train)
-    plain = value_and_gradients(Plain(), variables, pairs, train)
-    jax.tree.map(lambda x, y: np.testing.assert_allclose(x, y, atol=1e-10), ours, plain)
+@pytest.mark.parametrize("nearly", [0.0, 1e-6, 1e-4])
+def test_nearly_equal_features_have_no_direction_larger_than_one(nearly):
+    a, kernel = normal(1, 20, 64).astype(np.float32), normal(65, 4).astype(np.float32)
+    b = np.concatenate([a * (1 + nearly * normal(1, 20, 64, seed=1)), normal(1, 9, 64, seed=2)], axis=1).astype(np.float32)
+    pairs = np.asarray(first_layer(PairLayer(4), kernel, a, b))
+    assert np.abs(np.diagonal(pairs, axis1=1, axis2=2)).max() < np.linalg.norm(kernel, axis=0).max()
 
 
-def test_a_tower_has_the_parameters_of_the_plain_tower():
-    trees = [jax.eval_shape(functools.partial(layer.init, train=True), jax.random.key(0), pair_sum()) for layer in (Plain(), Tower(WIDTHS))]
-    assert jax.tree.structure(trees[0]) == jax.tree.structure(trees[1])
-    assert jax.tree.leaves(trees[0]) == jax.tree.leaves(trees[1])
-
-
-def test_statistics_of_a_sum_are_those_of_its_values():
-    ours, plain = pair_sum(3.0).moments(), moments([pair_sum(3.0).values()])
-    np.testing.assert_allclose(ours.mean, plain.mean, atol=1e-12)
-    np.testing.assert_allclose(ours.variance, plain.variance, atol=1e-12)
-    assert ours.count == plain.count == 2 * 8 * 7
-
-
-def test_statistics_keep_their_digits_in_float32_where_a_term_has_a_large_mean():
-    pairs = pair_sum()
-    pairs = PairSum(pairs.row, (PairTerm(1000 + pairs.terms[0].scale, None, pairs.terms[0].column),))
-    single = jax.tree.map(lambda x: x.astype(np.float32), pairs)
-    np.testing.assert_allclose(single.moments().variance, pairs.moments().variance, rtol=1e-3)
-
-
-def test_sums_add_and_normalise_as_their_values_do():
-    a, b = pair_sum(), pair_sum(1.0)
-    np.testing.assert_allclose((a + b).values(), a.values() + b.values(), atol=1e-12)
-    affine = (
-        BatchNorm(6)
-        .bind(
-            {
-                "params": {"scale": normal(6), "bias": normal(6, seed=1)},
-                "batch_stats": {"mean": normal(6, seed=2), "var": normal(6, seed=3) ** 2},
-            }
-        )
-        .affine(None)
-    )
-    np.testing.assert_allclose(a.normalised(affine).values(), affine(a.values()), atol=1e-12)
-
-
-@pytest.mark.parametrize("rows", [0, 1, 5, 8, 100])
-def test_chunks_join_to_the_whole(rows):
-    x = normal(2, 8, 7, 3)
-    chunks = chunks_of(2, 8, 7, 3, rows)(x)
-    assert chunks.shape[2] <= (rows or 8)
-    np.testing.assert_array_equal(joined(chunks), x)
-
-
-def test_a_sweep_has_the_gradients_of_the_function():
-    def function(shared, chunk):
-        return jnp.sin(chunk @ shared), jnp.sum(chunk)
-
-    def total(run):
-        def run_and_sum(shared, chunks):
-            y, s = run(shared, chunks)
-            return jnp.sum(y**2) + jnp.sum(s**3)
-
-        return run_and_sum
-
-    arguments = normal(4, 3), normal(5, 2, 4, seed=1)
-    ours = jax.jit(jax.grad(total(lambda *a: sweep(function, *a)), (0, 1)))(*arguments)
-    plain = jax.jit(jax.grad(total(lambda w, x: jax.vmap(lambda c: function(w, c))(x)), (0, 1)))(*arguments)
-    jax.tree.map(lambda x, y: np.testing.assert_allclose(x, y, atol=1e-12), ours, plain)
+@pytest.mark.parametrize("statistics", [fast_moments, lambda pairs: moments([plain_values(pairs)], "plain")], ids=["fast", "plain"])
+@pytest.mark.parametrize("gap", [1e-2, 1e-5, 1e-7])
+def test_statistics_keep_their_digits_where_the_pose_has_brought_points_onto_their_correspondents(gap, statistics):
+    b, kernel = normal(2, 20, 3).astype(np.float32), normal(7, 8, seed=1).astype(np.float32)
+    a = (b + gap * normal(2, 20, 3, seed=2)).astype(np.float32)
+    found = statistics(PairLayer(8, reverse=True).apply({"params": {"kernel": kernel}}, a, b, a))
+    difference = a.astype(np.float64)[:, :, None] - b[:, None]
+    length = np.linalg.norm(difference, axis=-1, keepdims=True)
+    inputs = np.concatenate([length, difference / (length + 1e-8), np.broadcast_to(a[:, :, None], difference.shape)], -1)
+    pairs = inputs @ kernel.astype(np.float64)
+    np.testing.assert_allclose(found.mean, pairs.mean(axis=(0, 1, 2)), atol=1e-5)
+    np.testing.assert_allclose(found.variance, pairs.var(axis=(0, 1, 2)), rtol=1e-5)

@@ -2,6 +2,7 @@
 
 import os
 import pickle
+from dataclasses import replace
 
 import jax
 import numpy as np
@@ -9,15 +10,13 @@ import pytest
 import safetensors.torch
 import torch
 
-from cmig_jax.parity.__main__ import main
+from cmig_jax.inference.load import load
+from cmig_jax.parity.cmignet_layout import layout, small
 from cmig_jax.parity.convert import convert
-from cmig_jax.parity.files import read_torch, write_torch
-from cmig_jax.parity.recorded import named_weights
-from cmig_jax.parity.sizes import SMALL
-from cmig_jax.parity.twin_run import state_shapes
-from cmig_jax.registration import load
+from cmig_jax.parity.torch_files import read_torch, write_torch
+from cmig_jax.parity.weights import named_weights
 
-STATE = {name: np.asarray(value, np.float32 if value.ndim else np.int64) for name, value in named_weights(state_shapes(SMALL), 0).items()}
+STATE = {name: np.asarray(value, np.float32 if value.ndim else np.int64) for name, value in named_weights(layout(small()), 0).items()}
 
 
 def tensors(state=STATE):
@@ -66,12 +65,12 @@ class Malicious:
 
 
 @pytest.mark.parametrize("save", [torch.save, lambda value, path: path.write_bytes(pickle.dumps(value))])
-def test_a_pickle_that_runs_code_is_refused(tmp_path, save, capsys):
+def test_a_pickle_that_runs_code_is_refused(tmp_path, save, main):
     save({"h3.6.bias": Malicious(tmp_path / "ran")}, tmp_path / "a.pt")
     with pytest.raises(ValueError, match=r"a\.pt: refused"):
         read_torch(tmp_path / "a.pt")
-    assert main(["convert", str(tmp_path / "a.pt"), str(tmp_path / "run")]) == 2
-    assert capsys.readouterr().err.count("\n") == 1
+    done = main("parity", "convert", tmp_path / "a.pt", tmp_path / "run")
+    assert (done.returncode, done.stderr.count("\n")) == (2, 1)
     assert not (tmp_path / "ran").exists()
     assert not (tmp_path / "run").exists()
 
@@ -97,15 +96,15 @@ def test_other_things_than_a_state_are_refused(tmp_path, content):
 
 
 @pytest.mark.parametrize("dtype", [np.float32, np.float64])
-def test_through_a_run_folder_and_back(tmp_path, dtype, capsys):
-    state = {name: value.astype(dtype) if value.ndim else value + 12 for name, value in named_weights(state_shapes(SMALL), 3).items()}
+def test_through_a_run_folder_and_back(tmp_path, dtype, main):
+    state = {name: value.astype(dtype) if value.ndim else value + 12 for name, value in named_weights(layout(small()), 3).items()}
     write_torch(tmp_path / "in.t7", state)
-    assert main(["convert", str(tmp_path / "in.t7"), str(tmp_path / "run")]) == 0
-    said = capsys.readouterr().out
+    done = main("parity", "convert", tmp_path / "in.t7", tmp_path / "run")
+    assert done.returncode == 0, done.stderr
     for unused in ("significance_fc.conv.0.conv.weight", "MVCNN.fc.0.bias", "head.reflect"):
-        assert unused in said
-    assert main(["convert", str(tmp_path / "run"), str(tmp_path / "out.safetensors")]) == 0
-    assert main(["convert", str(tmp_path / "run"), str(tmp_path / "out.pt")]) == 0
+        assert unused in done.stdout
+    assert main("parity", "convert", tmp_path / "run", tmp_path / "out.safetensors").returncode == 0
+    assert main("parity", "convert", tmp_path / "out.safetensors", tmp_path / "out.pt").returncode == 0
     assert same(read_torch(tmp_path / "out.pt"), state)
     back = safetensors.torch.load_file(tmp_path / "out.safetensors")
     assert all(np.array_equal(back[name].numpy(), state[name]) for name in state)
@@ -115,13 +114,15 @@ def test_a_converted_run_loads(tmp_path):
     write_torch(tmp_path / "in.pth", STATE)
     convert(tmp_path / "in.pth", tmp_path / "run")
     network = load(tmp_path / "run")
-    assert network.config.model.fusion.image == "transformer"
+    hidden = replace(small(), points=replace(small().points, k=20), fusion=replace(small().fusion, heads=4))
+    assert network.config.model == replace(hidden, keypoints=replace(hidden.keypoints, count=256))  # they leave no trace in a state
+    assert network.step == 0
     kernel = jax.device_get(network.variables)["params"]["transformer"]["decoder_cross"]["value"]["kernel"]
     assert np.array_equal(kernel, STATE["attn.model.decoder.layers.0.src_attn.linears.2.weight"].T)
 
 
 def test_what_training_changed_goes_back_changed(tmp_path):
-    exact = {name: value.astype(np.float64) if value.ndim else value for name, value in named_weights(state_shapes(SMALL), 3).items()}
+    exact = {name: value.astype(np.float64) if value.ndim else value for name, value in named_weights(layout(small()), 3).items()}
     write_torch(tmp_path / "in.pt", exact)
     convert(tmp_path / "in.pt", tmp_path / "run")
     other = {name: value + 1 if name == "h3.0.bias" else value for name, value in exact.items()}
@@ -132,7 +133,7 @@ def test_what_training_changed_goes_back_changed(tmp_path):
     assert np.array_equal(back["h3.2.bias"], exact["h3.2.bias"])
 
 
-def test_bad_requests_are_one_line(tmp_path, capsys):
+def test_bad_requests_are_one_line(tmp_path, main):
     write_torch(tmp_path / "in.pt", STATE)
     write_torch(tmp_path / "part.pt", {name: value for name, value in STATE.items() if name != "h3.6.bias"})
     (tmp_path / "there").mkdir()
@@ -143,8 +144,7 @@ def test_bad_requests_are_one_line(tmp_path, capsys):
         ("absent.pt", "run", "absent.pt"),
         ("there", "other", "expected a PyTorch file"),
     ):
-        assert main(["convert", str(tmp_path / source), str(tmp_path / target)]) == 2
-        said = capsys.readouterr().err
-        assert reason in said
-        assert said.count("\n") == 1
+        done = main("parity", "convert", tmp_path / source, tmp_path / target)
+        assert (done.returncode, done.stderr.count("\n")) == (2, 1)
+        assert reason in done.stderr
     assert not (tmp_path / "run").exists()

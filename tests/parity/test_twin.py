@@ -1,94 +1,87 @@
-"""The PyTorch twin: names and shapes, recorded cases (where present), modes, draws."""
+"""The PyTorch twin: recorded cases where they are, draws, losses, the benchmark's calls."""
 
-import json
-import os
-from pathlib import Path
+from dataclasses import replace
 
 import numpy as np
 import pytest
 import torch
 
-from cmig_jax.parity.recorded import named_weights, random_inputs, read_case, recorded_form
-from cmig_jax.parity.sizes import SMALL, Sizes
-from cmig_jax.parity.twin import Twin
-from cmig_jax.parity.twin_run import make_twin, record_case, run_twin, state_shapes
+from cmig_jax.parity.cmignet_bench import TwinBench
+from cmig_jax.parity.cmignet_check import flags_of_case
+from cmig_jax.parity.cmignet_compare import run_twin
+from cmig_jax.parity.cmignet_layout import UNUSED, layout, small, with_margins
+from cmig_jax.parity.cmignet_twin import Twin
+from cmig_jax.parity.inputs import random_inputs, random_pairs
+from cmig_jax.parity.rows import compare_all
+from cmig_jax.parity.weights import named_weights
+
+from .recording import GOLDEN, read_whole
 
 torch.set_num_threads(1)
-GOLDEN = Path(os.environ.get("CMIG_SHARED", Path(__file__).parents[3] / "shared")) / "golden"
-recorded = pytest.mark.skipif(not GOLDEN.is_dir(), reason="no recorded cases here")
+FLAGS = small()
+STATE = named_weights(layout(FLAGS), 0)
 
 
-def test_state_has_the_released_size():
-    shapes = state_shapes(Sizes())
-    trainable = ("running_mean", "running_var", "num_batches_tracked")
-    assert sum(int(np.prod(shape)) for name, shape in shapes.items() if not name.endswith(trainable)) == 18_106_876
-
-
-@recorded
-def test_state_is_the_released_one():
-    recorded_shapes = {name: tuple(shape) for name, shape in json.loads((GOLDEN / "state_dict_shapes.json").read_text()).items()}
-    assert list(state_shapes(Sizes()).items()) == list(recorded_shapes.items())
-
-
-@recorded
+@pytest.mark.skipif(not GOLDEN.is_dir(), reason="no recorded cases here")
 @pytest.mark.parametrize(("name", "margins"), [("eval_seed0", None), ("train_ocl_seed0", (6, 8))])
-def test_twin_repeats_the_recorded_case(name, margins):
-    case = read_case(GOLDEN / f"{name}.npz")
-    sizes = Sizes(keypoints=case.keypoints, iterations=case.iterations)
-    twin = make_twin(sizes, named_weights(state_shapes(sizes), 0), margins=margins)
-    run = run_twin(twin, case.inputs, case.training)
-    for key, expected in case.outputs.items():
-        if key.startswith("grad_norm/"):
-            np.testing.assert_allclose(
-                np.linalg.norm(run.gradients[key.removeprefix("grad_norm/")]), expected, rtol=1e-6, atol=1e-12, err_msg=key
-            )
-        elif key.startswith("buffer_sum/"):
-            np.testing.assert_allclose(run.buffers[key.removeprefix("buffer_sum/")].sum(), expected, rtol=1e-6, err_msg=key)
-        else:
-            value = recorded_form(key, run.outputs)
-            assert value is not None, key
-            assert np.abs(value - expected).max() <= 1e-8 * np.abs(expected).max(), key
-    assert {key.removeprefix("grad_norm/") for key in case.outputs if key.startswith("grad_norm/")} == set(run.gradients)
+def test_the_twin_repeats_the_recorded_case(name, margins):
+    case = read_whole(GOLDEN / f"{name}.npz")
+    flags = flags_of_case(case, margins=margins)
+    state = named_weights(layout(flags), 0)
+    run = {f"statistics/{key}": value for key, value in state.items()} | run_twin(Twin(flags, state), case.inputs, "src_idx" in case.inputs)
+    assert not [row for row in compare_all(case.outputs, run, "float64") if not row.holds]
+    gradients = {key.partition("/")[2] for key in run if key.startswith("gradient/")}
+    assert gradients == {key.partition("/")[2] for key in case.outputs if key.startswith("grad_norm/")}
 
 
 def test_training_draws_keypoints_and_repeats_them():
     inputs = random_inputs(0, pairs=2, points=40, views=2, size=32)
-    case = record_case(SMALL, inputs, train=True, seed=0)
-    assert case.inputs.src_idx is not None
-    assert case.inputs.src_idx.shape == (2, 24)
-    assert all(len(np.unique(half)) == 12 for row in case.inputs.src_idx for half in np.split(row, 2))
-    again = record_case(SMALL, case.inputs, train=True, seed=0)
-    assert all(np.array_equal(case.outputs[key], again.outputs[key]) for key in case.outputs)
-    assert case.outputs["loss_terms"].shape == (3 + 2 * 2,)
-    assert "grad_norm/h3.0.weight" in case.outputs
-    assert not any("significance_fc" in key or "MVCNN.fc" in key for key in case.outputs if key.startswith("grad_norm/"))
+    run = run_twin(Twin(FLAGS, STATE), inputs, train=True, seed=0)
+    assert run["src_idx"].shape == (2, 24)
+    assert all(len(np.unique(half)) == 12 for row in run["src_idx"] for half in np.split(row, 2))
+    again = run_twin(Twin(FLAGS, STATE), inputs | {"src_idx": run["src_idx"].astype(np.int32)}, train=True)
+    assert all(np.array_equal(run[key], again[key]) for key in run)
+    assert run["loss_terms"].shape == (3 + 2 * 2,)
+    assert "gradient/h3.0.weight" in run
+    assert not any(key.partition("/")[2].startswith(UNUSED) for key in run)
 
 
-def test_overlap_loss_is_an_option():
+def test_the_overlap_loss_is_an_option():
     inputs = random_inputs(0, pairs=2, points=40, views=1, size=32)
-    off, on = (record_case(SMALL, inputs, train=True, seed=0, margins=m).outputs["loss_terms"] for m in (None, (0.5, 8.0)))
+    runs = [run_twin(Twin(with_margins(FLAGS, margins), STATE), inputs, train=True) for margins in (None, (0.5, 8.0))]
+    off, on = (run["loss_terms"] for run in runs)
     assert off[1] == 0
     assert on[1] > 0
     assert np.array_equal(np.delete(off, 1), np.delete(on, 1))
 
 
 def test_evaluation_gives_a_rotation_and_no_losses():
-    case = record_case(SMALL, random_inputs(1, pairs=3, points=40, views=2, size=40), train=False, seed=2)
-    R = case.outputs["R"]
-    np.testing.assert_allclose(R @ R.transpose(0, 2, 1), np.broadcast_to(np.eye(3), R.shape), atol=1e-12)
-    np.testing.assert_allclose(np.linalg.det(R), 1)
-    assert not case.training
-    assert "loss" not in case.outputs
-
-
-def test_training_needs_the_true_pose():
-    twin = Twin(SMALL).train()
-    with pytest.raises(ValueError, match="true pose"):
-        twin(torch.rand(2, 3, 20), torch.rand(2, 3, 20), torch.rand(2, 1, 3, 32, 32))
+    run = run_twin(Twin(FLAGS, named_weights(layout(FLAGS), 2)), random_inputs(1, pairs=3, points=40, views=2, size=40), train=False)
+    np.testing.assert_allclose(run["R"] @ run["R"].transpose(0, 2, 1), np.broadcast_to(np.eye(3), (3, 3, 3)), atol=1e-12)
+    np.testing.assert_allclose(np.linalg.det(run["R"]), 1)
+    assert not any(key.startswith(("loss", "gradient/", "statistics/")) for key in run)
 
 
 def test_a_foreign_state_is_refused():
-    state = named_weights(state_shapes(SMALL), 0)
-    state.pop("h3.6.bias")
-    with pytest.raises(RuntimeError, match=r"h3\.6\.bias"):
-        make_twin(SMALL, state)
+    with pytest.raises(ValueError, match=r"missing h3\.6\.bias"):
+        Twin(FLAGS, {name: value for name, value in STATE.items() if name != "h3.6.bias"})
+
+
+@pytest.mark.parametrize("images", [True, False])
+def test_the_benchmarks_calls(images):
+    source, target, R, t = random_pairs(0, 2, 40)
+    views = np.random.default_rng(0).integers(0, 256, (2, 3, 32, 32)).astype(np.uint8)
+    features = np.random.default_rng(0).random((2, FLAGS.points.dim), np.float32)
+    bench = TwinBench(FLAGS, STATE, source, target, views if images else features, R, t, "cpu")
+    assert bench.inference()().shape == (2, 3, 3)
+    names = {"point_encoder", "fusion", "scores", "matching"} | ({"image_encoder"} if images else set())
+    for train in (False, True):
+        stages = bench.stages(train)
+        assert set(stages) == names
+        assert all(torch.isfinite(x).all() and x.requires_grad == train for work in stages.values() for x in work())
+    step = bench.training()
+    before = bench.twin.parameters["h3.0.weight"].detach().clone()
+    assert np.isfinite([step(), step()]).all()
+    assert not torch.equal(before, bench.twin.parameters["h3.0.weight"])
+    whole = TwinBench(replace(FLAGS), STATE, source, target, views if images else features, R, t, "cpu").inference()()
+    assert torch.isfinite(whole).all()

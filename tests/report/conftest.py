@@ -6,12 +6,14 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from cmig_jax.config import Config, DataConfig
-from cmig_jax.metrics import isotropic_errors
-from cmig_jax.report.errors import Errors, Found
+from cmig_jax.config import DataConfig
+from cmig_jax.evaluation.errors import Errors, Estimates
+from cmig_jax.evaluation.matches import Matches
+from cmig_jax.evaluation.metrics import isotropic_errors
 from cmig_jax.report.gallery import Example, choose
-from cmig_jax.report.matches import Matches
 from cmig_jax.report.page import Report
+from cmig_jax.transform import RigidTransform
+from configs import PRESETS
 
 HOSTILE = '</script><img src=x onerror="alert(1)"> & $\\frac{ <!--'
 
@@ -23,7 +25,8 @@ def errors_of(count: int = 30, category: str = "chair") -> Errors:
     for name, size in {"identity": 1.0, "ICP": 0.1, "CMIGNet": 0.03, "CMIGNet + ICP": 0.0}.items():
         found_R = Rotation.from_rotvec(size * rng.normal(size=(count, 3))).as_matrix() @ R
         found_t = t + size * rng.normal(size=(count, 3))
-        methods[name] = Found(found_R, found_t, *isotropic_errors(found_R, found_t, R, t))
+        errors = isotropic_errors(RigidTransform(R=found_R, t=found_t), RigidTransform(R=R, t=t))
+        methods[name] = Estimates(found_R, found_t, *errors)
     return Errors(
         methods=methods,
         network="CMIGNet",
@@ -32,7 +35,6 @@ def errors_of(count: int = 30, category: str = "chair") -> Errors:
         angle_deg=np.degrees(Rotation.from_matrix(R).magnitude()),
         overlap=rng.uniform(0.3, 1, count),
         category=[category, "table"] * (count // 2),
-        index=np.arange(count),
     )
 
 
@@ -56,7 +58,7 @@ def example_of(
 def report_of(errors: Errors, examples: list[Example]) -> Report:
     results = {name: {"rmse_r_deg": float(np.sqrt(np.mean(f.rotation_deg**2))), "pairs": len(errors)} for name, f in errors.methods.items()}
     results |= {"command": "python evaluate.py 'runs/a <b>' --report", "config": {}, "versions": {"python": "3.11", "jax": "0.10"}}
-    config = dataclasses.replace(Config(), data=DataConfig(source="shapes"))
+    config = dataclasses.replace(PRESETS["corrected"](), data=DataConfig(source="shapes"))
     return Report("a <b>", "best, step 7", config, results, errors, examples, [])
 
 

@@ -6,9 +6,10 @@ from html.parser import HTMLParser
 
 import pytest
 
-from cmig_jax.config import Config, DataConfig
+from cmig_jax.config import DataConfig, ViewsConfig
 from cmig_jax.report.figures import write_figures
-from cmig_jax.report.page import protocol, write_page
+from cmig_jax.report.page import protocol, view_titles, write_page
+from configs import PRESETS
 
 EMPTY = {"meta", "img", "input"}
 
@@ -124,11 +125,27 @@ def test_twenty_large_pairs_stay_below_ten_megabytes(tmp_path, make_errors, make
     [
         ({}, ["modelnet40-hdf5, all categories, 12 pairs; 1024 points sampled once", "shared crop to 75%", "noise 0.01 clipped at 0.05"]),
         ({"noise_std": 0.0, "crop": "none", "sampling": "twice"}, ["sampled twice, no crop, no noise"]),
-        ({"exclude": ("cone", "vase"), "max_angle_deg": 60.0}, ["all categories without cone, vase", "up to 60° per axis"]),
+        ({"exclude": ("cone", "vase"), "max_angle_deg": 60.0}, ["all categories without cone, vase", "up to 60° per axis,"]),
+        ({"turn": "either"}, ["up to 45° per axis to either side,"]),
         ({"source": "stanford-scans"}, ["stanford-scans, 12 recorded pairs turned by up to 45°, 768 points per cloud"]),
     ],
 )
 def test_the_protocol_in_one_line(data, said):
-    line = protocol(dataclasses.replace(Config(), data=DataConfig(**data)), 12)
+    line = protocol(dataclasses.replace(PRESETS["paper"](), data=DataConfig(**data)), 12)
     assert all(text in line for text in said)
     assert "\n" not in line
+
+
+@pytest.mark.parametrize(
+    ("views", "titles"),
+    [
+        ({"of": "object"}, ["6 depth views of the complete object"]),
+        ({"of": "source"}, ["6 depth views of the source"]),
+        ({"of": "target"}, ["6 depth views of the target"]),
+        ({"of": "both"}, ["6 depth views of the source", "6 depth views of the target"]),
+        ({"of": "object", "shown": "shuffled"}, ["6 depth views of the complete object of another pair"]),
+        ({"of": "target", "shown": "zero"}, ["6 black views in place of depth views of the target"]),
+    ],
+)
+def test_the_title_of_views_says_what_they_show(views, titles):
+    assert view_titles(ViewsConfig(count=6, layout="axes", **views)) == titles

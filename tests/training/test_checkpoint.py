@@ -8,10 +8,12 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from cmig_jax.config import Config
-from cmig_jax.training.checkpoint import Checkpoints, differences, is_validated, load_state, read_config, validation_error, write_config
-from cmig_jax.training.mesh import device_mesh, replicated
+from cmig_jax.config_json import differences
+from cmig_jax.devices import device_mesh, replicated
+from cmig_jax.inference.run_folder import is_validated, load_variables, read_config, validation_error
+from cmig_jax.training.checkpoint import Checkpoints, write_config
 from cmig_jax.training.state import TrainState
+from configs.modelnet40 import paper
 
 POSITION = {"next_index": 12, "shards": [1, 2]}
 
@@ -49,6 +51,13 @@ def assert_is(state, step):
     jax.tree.map(lambda a, b: np.testing.assert_array_equal(np.array(a), np.array(b)), state, make_state(step))
 
 
+def load(run, which="best", like=None):
+    """Load the variables, and check that they are those of the step that is returned with them."""
+    step, variables = load_variables(run, abstract().variables if like is None else like, which)
+    jax.tree.map(lambda a, b: np.testing.assert_array_equal(np.array(a), np.array(b)), variables, make_state(step).variables)
+    return step
+
+
 def test_what_is_saved_comes_back_with_the_position_of_the_pipeline(tmp_path):
     save(tmp_path, [3.0])
     checkpoints = Checkpoints(tmp_path)
@@ -69,8 +78,8 @@ def test_the_best_on_validation_and_the_last_are_kept(tmp_path):
     save(tmp_path, [5.0, 2.0, 4.0, 3.0, None])
     kept = sorted(int(path.name) for path in (tmp_path / "checkpoints").iterdir() if path.is_dir())
     assert kept == [20, 50]
-    assert_is(load_state(tmp_path, abstract()), 20)
-    assert_is(load_state(tmp_path, abstract(), "last"), 50)
+    assert load(tmp_path) == 20
+    assert load(tmp_path, "last") == 50
 
 
 def test_the_best_has_the_smallest_motion_to_the_true_pose_not_the_smallest_angle_alone():
@@ -83,7 +92,7 @@ def test_the_best_has_the_smallest_motion_to_the_true_pose_not_the_smallest_angl
 
 def test_a_run_that_was_never_validated_has_its_last_state(tmp_path):
     save(tmp_path, [None, None])
-    assert_is(load_state(tmp_path, abstract(), "best"), 20)
+    assert load(tmp_path, "best") == 20
     assert not is_validated(tmp_path)
     save(tmp_path / "another", [1.0, None])
     assert is_validated(tmp_path / "another")
@@ -94,34 +103,37 @@ def test_a_step_is_saved_once(tmp_path):
     checkpoints = Checkpoints(tmp_path)
     checkpoints.save(10, make_state(10), POSITION)
     checkpoints.close()
-    assert_is(load_state(tmp_path, abstract()), 10)
+    assert load(tmp_path) == 10
 
 
 def test_a_state_of_eight_devices_restores_on_one(tmp_path):
     save(tmp_path, [1.0], devices=8)
-    state = load_state(tmp_path, abstract(devices=1))
+    checkpoints = Checkpoints(tmp_path)
+    state, _ = checkpoints.restore_last(abstract(devices=1))
+    checkpoints.close()
     assert_is(state, 10)
     assert {len(leaf.sharding.device_set) for leaf in jax.tree.leaves(state)} == {1}
+    assert load(tmp_path) == 10
 
 
 def test_no_checkpoints_folder_is_named(tmp_path):
     with pytest.raises(ValueError, match=f"{tmp_path}/checkpoints: expected checkpoints, found no such folder"):
-        load_state(tmp_path, abstract())
+        load(tmp_path)
 
 
 def test_a_folder_without_a_checkpoint_is_named(tmp_path):
     save(tmp_path, [])
     with pytest.raises(ValueError, match=f"{tmp_path}/checkpoints: expected a checkpoint, found none"):
-        load_state(tmp_path, abstract())
+        load(tmp_path)
 
 
 def test_a_checkpoint_of_another_network_is_refused(tmp_path):
     save(tmp_path, [1.0])
     with pytest.raises(ValueError, match=r"checkpoints, step 10: expected a whole checkpoint of the network in config\.json"):
-        load_state(tmp_path, abstract(width=4))
-    other = abstract().replace(params={"another": abstract().params["layer"]})
+        load(tmp_path, like=abstract(width=4).variables)
+    other = {**abstract().variables, "params": {"another": abstract().params["layer"]}}
     with pytest.raises(ValueError, match="step 10: expected a whole checkpoint of the network"):
-        load_state(tmp_path, other)
+        load(tmp_path, like=other)
 
 
 def damage_removed_arrays(step):
@@ -145,7 +157,7 @@ def test_a_folder_of_emptied_files_is_named(tmp_path):
         if path.is_file():
             path.write_text("")
     with pytest.raises(ValueError, match=f"{tmp_path}/checkpoints.*: expected a whole checkpoint of the network"):
-        load_state(tmp_path, abstract())
+        load(tmp_path)
 
 
 @pytest.mark.parametrize("damage", [damage_removed_arrays, damage_truncated, damage_emptied_metadata])
@@ -154,7 +166,7 @@ def test_a_damaged_checkpoint_is_refused(tmp_path, damage):
     damage(tmp_path / "checkpoints" / "10")
     message = "checkpoints, step 10: expected a whole checkpoint of the network"
     with pytest.raises(ValueError, match=message) as refused:
-        load_state(tmp_path, abstract())
+        load(tmp_path)
     assert len(str(refused.value)) < 600
     assert "\n" not in str(refused.value)
     checkpoints = Checkpoints(tmp_path)
@@ -164,7 +176,7 @@ def test_a_damaged_checkpoint_is_refused(tmp_path, damage):
 
 
 def test_a_run_folder_keeps_its_config(tmp_path):
-    run, config = tmp_path / "runs" / "one", Config(name="one", seed=3)
+    run, config = tmp_path / "runs" / "one", dataclasses.replace(paper(), name="one", seed=3)
     write_config(run, config)
     assert read_config(run) == config
     write_config(run, config)
@@ -172,17 +184,17 @@ def test_a_run_folder_keeps_its_config(tmp_path):
 
 
 def test_another_config_is_refused_by_the_flags_that_differ(tmp_path):
-    write_config(tmp_path, Config())
-    changed = dataclasses.replace(Config(), seed=5, data=dataclasses.replace(Config().data, noise_std=0.0))
-    with pytest.raises(ValueError, match=r"config\.json is of another config \(seed: 0 -> 5; data\.noise_std: 0\.01 -> 0\.0\)"):
+    write_config(tmp_path, paper())
+    changed = dataclasses.replace(paper(), seed=5, data=dataclasses.replace(paper().data, noise_std=0.0))
+    with pytest.raises(ValueError, match=r"config\.json has another config \(seed: 0 -> 5; data\.noise_std: 0\.01 -> 0\.0\)"):
         write_config(tmp_path, changed)
-    assert read_config(tmp_path) == Config()
-    assert differences(Config(), Config()) == []
+    assert read_config(tmp_path) == paper()
+    assert differences(paper(), paper()) == []
 
 
 def test_where_things_are_may_change_where_a_run_continues(tmp_path):
-    write_config(tmp_path, Config())
-    moved = dataclasses.replace(Config(), name="renamed", data=dataclasses.replace(Config().data, root="elsewhere"))
+    write_config(tmp_path, paper())
+    moved = dataclasses.replace(paper(), name="renamed", data=dataclasses.replace(paper().data, root="elsewhere"))
     write_config(tmp_path, moved)
     assert read_config(tmp_path) == moved
 

@@ -15,16 +15,16 @@ import jax
 import numpy as np
 import pytest
 
-from cmig_jax.config import FusionConfig, ImageConfig, LossConfig, MatchingConfig, PointsConfig
-from cmig_jax.nn.build import build
+from cmig_jax.devices import device_mesh, replicated
+from cmig_jax.inference.predictor import Predictor
+from cmig_jax.inference.run_folder import load_variables
+from cmig_jax.models.cmignet.flags import FusionFlags, ImageFlags, LossFlags, MatchingFlags, PointsFlags
 from cmig_jax.training import loop
-from cmig_jax.training.checkpoint import load_state
 from cmig_jax.training.loop import Interrupted, train, training_data
-from cmig_jax.training.mesh import device_mesh, replicated
 from cmig_jax.training.optim import optimizer
-from cmig_jax.training.predict import Predictor
 from cmig_jax.training.processes import in_turn
-from cmig_jax.training.state import abstract_state
+from cmig_jax.training.state import abstract_state, build
+from cmig_jax.transform import RigidTransform
 
 pytestmark = pytest.mark.usefixtures("compiled_once")
 TOTAL = 6  # three epochs of two steps
@@ -39,14 +39,14 @@ def small(tiny):
     """Networks with batch statistics of points and pixels and a loss between pairs, but quickly compiled; validated at the end."""
     model = dataclasses.replace(
         tiny.model,
-        points=PointsConfig(k=6, widths=(8,), dim=16),
-        image=ImageConfig(widths=(16,), blocks=(1,)),
-        fusion=FusionConfig(points="none", image="none"),
-        matching=MatchingConfig(head="pcrnet", iterations=1),
+        points=PointsFlags(k=6, widths=(8,), dim=16),
+        image=ImageFlags(widths=(16,), blocks=(1,)),
+        fusion=FusionFlags(points="none", image="none"),
+        matching=MatchingFlags(head="pcrnet", iterations=1),
+        loss=LossFlags(overlap=False, cross_modal="nt-xent"),
     )
-    loss = LossConfig(overlap="off", cross_modal="nt-xent")
     optim = dataclasses.replace(tiny.optim, epochs=3, validate_every=3)
-    return dataclasses.replace(tiny, name="small", model=model, loss=loss, optim=optim)
+    return dataclasses.replace(tiny, name="small", model=model, optim=optim)
 
 
 @pytest.fixture(scope="module")
@@ -151,14 +151,13 @@ def test_validation_over_eight_devices_equals_one(small, one_device, batch):
     found = []
     for mesh in (None, device_mesh(batch, 8)):
         like = abstract_state(model, rule, small, mesh or device_mesh(batch, 1))
-        found.append(Predictor(model, batch, mesh).beside_truth(load_state(one_device, like).variables, pairs))
+        found.append(Predictor(model, batch, mesh).beside_truth(load_variables(one_device, like.variables)[1], pairs))
     (one, true), (eight, true_of_eight) = found
-    assert len(pairs) == len(one[0]) == 6
+    assert len(pairs) == len(one.t) == 6
     jax.tree.map(lambda a, b: np.testing.assert_allclose(a, b, rtol=1e-4, atol=1e-5), eight, one)
-    for i, name in enumerate(("R", "t")):
-        expected = np.stack([pair[name] for pair in pairs])
-        np.testing.assert_array_equal(true[i], expected)
-        np.testing.assert_array_equal(true_of_eight[i], expected)
+    expected = RigidTransform(R=np.stack([pair["R"] for pair in pairs]), t=np.stack([pair["t"] for pair in pairs]))
+    for poses in (true, true_of_eight):
+        jax.tree.map(np.testing.assert_array_equal, poses, expected)
 
 
 def test_devices_hold_consecutive_pairs():

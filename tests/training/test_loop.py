@@ -1,4 +1,4 @@
-"""Runs: to their end, interrupted, killed, poisoned; what goes on afterwards equals a run that was left alone, bit for bit."""
+"""Runs: to their end, interrupted, killed, with bad numbers; a continued run equals an uninterrupted one, bit for bit."""
 
 import dataclasses
 import json
@@ -9,20 +9,20 @@ import numpy as np
 import pytest
 
 from cmig_jax.data.shards import Shards
-from cmig_jax.nn.build import build
+from cmig_jax.devices import device_mesh
+from cmig_jax.inference.run_folder import read_config
 from cmig_jax.training import loop
-from cmig_jax.training.checkpoint import Checkpoints, load_state, read_config, write_config
+from cmig_jax.training.checkpoint import Checkpoints, write_config
 from cmig_jax.training.loop import Interrupted, NonFiniteLoss, train, training_data
-from cmig_jax.training.mesh import device_mesh
 from cmig_jax.training.optim import optimizer
-from cmig_jax.training.state import abstract_state
+from cmig_jax.training.state import abstract_state, build
 
 pytestmark = pytest.mark.usefixtures("compiled_once")
 TOTAL = 8  # four epochs of two steps
 
 
 class Killed(BaseException):
-    """Stands for a process that ends without another word."""
+    """Stands for a process that is killed."""
 
 
 @pytest.fixture(scope="module")
@@ -65,8 +65,11 @@ def kill(batch):
 
 
 def last_state(config, run):
-    like = abstract_state(build(config), optimizer(config.optim, 4), config, device_mesh(1, 1))
-    return jax.tree.map(np.array, load_state(run, like, "last"))
+    checkpoints = Checkpoints(run)
+    restored = checkpoints.restore_last(abstract_state(build(config), optimizer(config.optim, 4), config, device_mesh(1, 1)))
+    checkpoints.close()
+    assert restored is not None
+    return jax.tree.map(np.array, restored[0])
 
 
 def lines(run):
@@ -113,9 +116,12 @@ def test_a_killed_run_continues_bit_for_bit(tiny, uninterrupted, tmp_path, at_ba
         train(tiny, tmp_path, progress=False, devices=1)
     with (tmp_path / "log.jsonl").open("a") as log:
         log.write('{"step": 7, "lo')  # a line that was being written
+    for name in (".config.99.partial.json", ".log.99.partial.jsonl"):  # files that were being written
+        (tmp_path / name).write_text("{")
     monkeypatch.undo()
     train(tiny, tmp_path, resume=True, progress=False, devices=1)
     assert_same_end(tiny, tmp_path, uninterrupted)
+    assert not list(tmp_path.glob(".*"))
 
 
 def test_resuming_a_finished_run_changes_nothing(tiny, uninterrupted):
@@ -142,7 +148,7 @@ def test_a_folder_that_holds_a_run_needs_resume(tiny, uninterrupted):
 
 
 def test_a_run_is_not_continued_with_other_flags(tiny, uninterrupted):
-    with pytest.raises(ValueError, match=r"is of another config \(seed: 0 -> 1\): continue with its flags, or choose another --name"):
+    with pytest.raises(ValueError, match=r"has another config \(seed: 0 -> 1\): continue with its flags, or choose another --name"):
         train(dataclasses.replace(tiny, seed=1), uninterrupted, resume=True, progress=False, devices=1)
 
 
@@ -157,6 +163,12 @@ def test_models_for_evaluation_are_refused_before_they_are_prepared(tiny, tmp_pa
     config = dataclasses.replace(tiny, data=dataclasses.replace(tiny.data, source="stanford", root=str(tmp_path)))
     with pytest.raises(ValueError, match=r"data\.source = stanford has no objects to train on"):
         train(config, tmp_path / "run", progress=False)
+
+
+def test_fewer_points_than_keypoints_are_refused(tiny, tmp_path):
+    few = dataclasses.replace(tiny, data=dataclasses.replace(tiny.data, points=20))
+    with pytest.raises(ValueError, match=r"data\.points = 20 leaves 15 points after the crop: expected at least 16"):
+        train(few, tmp_path / "run", progress=False)
 
 
 @pytest.mark.parametrize("change", [{"batch": 1000}, {"batch": 6}])
@@ -201,3 +213,11 @@ def test_validation_objects_are_training_objects_that_are_never_trained_on(tiny,
 def test_validation_pairs_are_the_same_each_time(tiny):
     first, second = training_data(tiny).validation[0], training_data(tiny).validation[0]
     jax.tree.map(np.testing.assert_array_equal, first, second)
+
+
+def test_too_few_points_for_the_keypoints_of_training_are_refused(tiny, tmp_path):
+    keypoints = dataclasses.replace(tiny.model.keypoints, count=40, test_count=20)
+    config = dataclasses.replace(tiny, model=dataclasses.replace(tiny.model, keypoints=keypoints))
+    with pytest.raises(ValueError, match=r"data\.points = 48 leaves 36 points after the crop: expected at least 40"):
+        train(config, tmp_path / "run", progress=False)
+    assert not (tmp_path / "run").exists()

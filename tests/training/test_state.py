@@ -7,11 +7,10 @@ import numpy as np
 import pytest
 
 from cmig_jax.data.loader import epoch_steps, stack
-from cmig_jax.nn.build import build
+from cmig_jax.devices import device_mesh, replicated, to_device
 from cmig_jax.training.loop import training_data
-from cmig_jax.training.mesh import device_mesh, replicated, to_device
 from cmig_jax.training.optim import optimizer
-from cmig_jax.training.state import abstract_state, create_state, make_step
+from cmig_jax.training.state import abstract_state, build, create_state, make_step
 
 KEY = jax.random.key(0)
 BATCH = 8

@@ -1,6 +1,6 @@
 """One of two processes that train, are interrupted in the second one alone, and continue: started by `test_distributed.py`.
 
-python two_processes.py PROCESS PORT RUN COPY [flags of train.py]
+python two_processes.py PROCESS PORT RUN COPY [arguments of `cmig train`]
 """
 
 import itertools
@@ -9,7 +9,7 @@ import signal
 import sys
 from pathlib import Path
 
-import train
+from cmig_jax import cli
 from cmig_jax.training import loop
 
 INTERRUPTED_AT = 2  # the vote of a step is known after the next one, which is then the last
@@ -34,10 +34,10 @@ def main(process: int, port: str, run: Path, copy: Path, flags: list[str]) -> li
     loop.make_step = make_step_once
     loop.to_device = interrupted_to_device
     meeting = ["--distributed", "--coordinator", f"127.0.0.1:{port}", "--processes", "2", "--process", str(process)]
-    codes = [train.main([*flags, *meeting])]
+    codes = [cli.main(["train", *flags, *meeting], cli.installed_catalogue)]
     if process == 0:
         shutil.copytree(run, copy)
-    return [*codes, train.main([*flags, "--resume"])]  # the processes have met already
+    return [*codes, cli.main(["train", *flags, "--resume"], cli.installed_catalogue)]  # the processes have met already
 
 
 if __name__ == "__main__":

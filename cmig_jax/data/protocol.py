@@ -1,0 +1,106 @@
+"""The protocol that turns an object into a pair: sampling, pose, noise, crop (Sec. IV-B and IV-C), and RPM-Net's variants."""
+
+from __future__ import annotations
+
+import numpy as np
+from scipy.spatial.transform import Rotation
+
+from cmig_jax.config import Crop, DataConfig, Sampling, Turn
+from cmig_jax.data.sources import source_of
+
+FAR = 500.0  # distance of the crop's far point: from there, "nearest" is a half-space up to rounding
+SYMMETRIC = ("bottle", "bowl", "cone", "cup", "flower_pot", "lamp", "tent", "vase")
+"""ModelNet40's categories of rotationally symmetric objects; without them 32 are left, a protocol of the literature (`data.exclude`)."""
+
+
+def make_clouds(points: np.ndarray, data: DataConfig, name: object, rng: np.random.Generator) -> dict[str, np.ndarray]:
+    """Draw the two clouds of a pair and the pose between them.
+
+    Args:
+        points: `[P, 3]` of the object, normalised.
+        data: flags of the protocol.
+        name: name of the object in an error.
+        rng: random generator.
+
+    Returns:
+        `source [N, 3]`, `target [M, 3]`, `R [3, 3]`, `t [3]` float32, with target = R source + t.
+
+    Raises:
+        ValueError: the object has too few points for `data.points` and `data.sampling`.
+    """
+    source, target = samplings(points, data.points, data.sampling, name, rng)
+    R, t = random_pose(rng, data.max_angle_deg, data.max_translation, data.turn)
+    clouds = [source, target @ R.T + t]
+    clouds = [cloud[rng.permutation(len(cloud))] for cloud in clouds]
+    if data.noise_std > 0:
+        clouds = [c + np.clip(rng.normal(0, data.noise_std, c.shape), -data.noise_clip, data.noise_clip) for c in clouds]
+    source, target = crop(clouds[0], clouds[1], data.crop, data.keep, rng)
+    return {key: value.astype(np.float32) for key, value in (("source", source), ("target", target), ("R", R), ("t", t))}
+
+
+def samplings(points: np.ndarray, count: int, sampling: Sampling, name: object, rng: np.random.Generator) -> tuple[np.ndarray, np.ndarray]:
+    """Return the clean points of both clouds, `[count, 3]` each.
+
+    `once`: the first `count` points for both. `twice`: the first and the last. `subsets`: two random subsets of all points, as RPM-Net
+    draws them (Yew and Lee, CVPR 2020).
+
+    Raises:
+        ValueError: fewer points than that, naming the object.
+    """
+    needed = 2 * count if sampling == "twice" else count
+    if len(points) < needed:
+        raise ValueError(f"{name} has {len(points)} points: expected at least {needed} for data.points={count}, sampling={sampling}")
+    if sampling == "subsets":
+        first, second = (rng.choice(len(points), count, replace=False) for _ in range(2))
+        return points[first], points[second]
+    return points[:count], points[:count] if sampling == "once" else points[-count:]
+
+
+def random_pose(
+    rng: np.random.Generator, max_angle_deg: float, max_translation: float, turn: Turn = "positive"
+) -> tuple[np.ndarray, np.ndarray]:
+    """Draw R = Rx Ry Rz `[3, 3]`, each angle uniform in [0 or -max, max] degrees, and t `[3]` uniform in [-max, max]."""
+    x, y, z = rng.uniform(-max_angle_deg if turn == "either" else 0, max_angle_deg, 3)
+    R = Rotation.from_euler("zyx", [z, y, x], degrees=True).as_matrix()
+    return R, rng.uniform(-max_translation, max_translation, 3)
+
+
+def mean_angle_deg(data: DataConfig) -> float:
+    """Return the mean of each of the three angles that `random_pose` draws; 0 for recorded pairs, whose angles have either sign."""
+    return 0.0 if data.turn == "either" or source_of(data).records else data.max_angle_deg / 2
+
+
+def crop(source: np.ndarray, target: np.ndarray, kind: Crop, keep: float, rng: np.random.Generator) -> tuple[np.ndarray, np.ndarray]:
+    """Keep the share `keep` of each cloud `[N, 3]`.
+
+    `shared`, `independent`: the points nearest to a far point, the same for both clouds or one each (lower overlap). `half-space`: the
+    points on one side of a plane, one each, with its normal uniform on the sphere (RPM-Net, which crops before adding noise).
+    """
+    if kind == "none":
+        return source, target
+    if kind == "half-space":
+        first, second = (rng.normal(size=3) for _ in range(2))
+        return keep_farthest_along(source, first, keep), keep_farthest_along(target, second, keep)
+    first = far_point(rng)
+    second = first if kind == "shared" else far_point(rng)
+    return keep_nearest(source, first, keep), keep_nearest(target, second, keep)
+
+
+def far_point(rng: np.random.Generator) -> np.ndarray:
+    """Draw u + 500 s (1, 1, 1), with u uniform in [0, 1]^3 and s = 1 or -1."""
+    return rng.uniform(0, 1, 3) + FAR * rng.choice([-1.0, 1.0])
+
+
+def keep_nearest(points: np.ndarray, centre: np.ndarray, keep: float) -> np.ndarray:
+    """Keep the round(keep * N) points of `[N, 3]` nearest to `centre [3]`, in their order."""
+    return _keep_smallest(points, np.sum((points.astype(np.float64) - centre) ** 2, axis=1), keep)
+
+
+def keep_farthest_along(points: np.ndarray, direction: np.ndarray, keep: float) -> np.ndarray:
+    """Keep the round(keep * N) points of `[N, 3]` farthest along `direction [3]`, in their order."""
+    return _keep_smallest(points, -points.astype(np.float64) @ direction, keep)
+
+
+def _keep_smallest(points: np.ndarray, value: np.ndarray, keep: float) -> np.ndarray:
+    count = round(len(points) * keep)
+    return points[np.sort(np.argpartition(value, count - 1)[:count])]

@@ -1,0 +1,37 @@
+"""The pairs of an evaluation: the same for every method and machine."""
+
+from __future__ import annotations
+
+from cmig_jax.config import Config
+from cmig_jax.data.pairs import Pairs, evenly_spaced, in_categories
+from cmig_jax.data.prepare import ensure_prepared
+from cmig_jax.data.recorded_pairs import RecordedPairs
+from cmig_jax.data.recordings import ensure_recordings
+from cmig_jax.data.shards import Shards
+from cmig_jax.data.sources import source_of
+
+
+def pairs_to_test(config: Config, limit: int | None = None) -> Pairs | RecordedPairs:
+    """Return the test pairs of a config: those of `data.test_categories`, or the recorded ones.
+
+    Args:
+        config: `data`, `views`, and whether the network reads views.
+        limit: how many of them, evenly spaced; None: all.
+
+    Raises:
+        ValueError: there is no test object, or fewer points per cloud than the network needs.
+    """
+    data, needs = config.data, config.model.needs
+    if data.cropped_points < needs.points:
+        left = f"data.points = {data.points} leaves {data.cropped_points} points after the crop"
+        raise ValueError(f"{left}: expected at least {needs.points}, which the network needs")
+    views = config.views if needs.views else None
+    if source_of(data).records:
+        return RecordedPairs(ensure_recordings(data), data, views, limit)
+    objects = Shards(folder := ensure_prepared(data, config.views), "test")
+    chosen = in_categories(objects.labels, objects.categories, data.test_categories, data.exclude)
+    chosen = chosen[evenly_spaced(len(chosen), limit)]
+    if len(chosen) == 0:
+        where = f"data.test_categories={data.test_categories} without data.exclude={data.exclude}"
+        raise ValueError(f"{folder}: expected test objects in {where}, found none")
+    return Pairs(objects, chosen, data, views, data.test_seed)

@@ -1,0 +1,74 @@
+"""What an experiment is: a protocol and rows, as data (`configs/experiments.py`)."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, field
+from typing import Any, Literal
+
+from cmig_jax.config import Config
+
+Flags = Mapping[str, Any]
+
+
+@dataclass(frozen=True)
+class Quoted:
+    """What the paper prints for a row."""
+
+    rmse_r_deg: float
+    mae_r_deg: float
+    rmse_t: float
+    mae_t: float
+
+
+@dataclass(frozen=True)
+class Row:
+    """One row of a table, or one point of a curve.
+
+    Attributes:
+        label: name in the table.
+        preset: what the row starts from.
+        flags: what it changes in training and test.
+        test: what it changes at test only.
+        then: refinement at test, by point-to-point or generalised ICP.
+        quoted: the paper's figures.
+    """
+
+    label: str
+    preset: str
+    flags: Flags = field(default_factory=dict)
+    test: Flags = field(default_factory=dict)
+    then: Literal["ICP", "GICP"] | None = None
+    quoted: Quoted | None = None
+
+
+@dataclass(frozen=True)
+class Experiment:
+    """A table or figure.
+
+    Attributes:
+        about: what it asks, in one line.
+        protocol: data flags of all its rows.
+        rows: the rows.
+        baselines: whether methods without learning stand beside the rows.
+    """
+
+    about: str
+    protocol: Flags
+    rows: tuple[Row, ...]
+    baselines: bool = False
+
+
+@dataclass(frozen=True)
+class Catalogue:
+    """What experiments are made of; the command line hands it in.
+
+    Attributes:
+        presets: functions that return a config, by name.
+        scales: functions that change the size of a config, by name; `full` changes nothing.
+        experiments: by name.
+    """
+
+    presets: Mapping[str, Callable[[], Config]]
+    scales: Mapping[str, Callable[[Config], Config]]
+    experiments: Mapping[str, Experiment]

@@ -1,0 +1,1 @@
+"""Registration of a user's own two clouds."""

@@ -10,10 +10,11 @@ import functools
 from pathlib import Path
 
 from cmig_jax.config import DataConfig
-from cmig_jax.data.geometry_files import SUFFIXES, geometry_files, read_geometry
-from cmig_jax.data.raw import RawDataset, RawObject, Source, Split, existing_folder
+from cmig_jax.data.geometry_files import SUFFIXES, geometry_files, read_object
+from cmig_jax.data.raw import RawDataset, RawObject, Source, Split, existing_folder, visible_files
 
 _TEST_SHARE = 0.2
+_MOST_NAMED = 5
 
 
 def open_meshes(data: DataConfig) -> RawDataset:
@@ -38,18 +39,29 @@ def _category(folder: Path, label: int) -> list[RawObject]:
         splits: dict[Split, list[Path]] = {"train": geometry_files(folder / "train"), "test": geometry_files(folder / "test")}
         for split, files in splits.items():
             if not files:
-                raise ValueError(f"{folder / split}: 0 objects; expected at least one file of {', '.join(SUFFIXES)}")
+                raise ValueError(
+                    f"{folder / split}: 0 objects{_passed_over(folder / split)}; expected at least one file of {', '.join(SUFFIXES)}"
+                )
     else:
         files = geometry_files(folder)
         if len(files) < 2:
-            raise ValueError(f"{folder}: a category with {len(files)} object(s); expected at least 2, one to train on and one to test on")
+            expected = f"expected at least 2 files of {', '.join(SUFFIXES)}, one to train on and one to test on"
+            raise ValueError(f"{folder}: a category with {len(files)} object(s){_passed_over(folder)}; {expected}")
         held = max(1, round(_TEST_SHARE * len(files)))
         splits = {"train": files[:-held], "test": files[-held:]}
     return [
-        RawObject(path.relative_to(folder.parent).as_posix(), label, split, functools.partial(read_geometry, path))
+        RawObject(path.relative_to(folder.parent).as_posix(), label, split, functools.partial(read_object, path))
         for split, files in splits.items()
         for path in files
     ]
+
+
+def _passed_over(folder: Path) -> str:
+    """Name the files of a folder that are not read, for an error."""
+    read = geometry_files(folder)
+    others = [path.name for path in visible_files(folder, "*") if path not in read]
+    named = ", ".join(others[:_MOST_NAMED]) + (f" and {len(others) - _MOST_NAMED} more" if len(others) > _MOST_NAMED else "")
+    return f" (passed over: {named})" if others else ""
 
 
 SOURCE = Source("meshes", open_meshes)

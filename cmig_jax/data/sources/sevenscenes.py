@@ -16,7 +16,7 @@ import trimesh
 from PIL import Image
 
 from cmig_jax.config import DataConfig
-from cmig_jax.data.geometry_files import read_geometry
+from cmig_jax.data.geometry_files import read_object
 from cmig_jax.data.raw import RawDataset, RawObject, RecordedDataset, Recording, Source, existing_folder, visible_files
 
 FRAMES_PER_FRAGMENT = 50
@@ -38,7 +38,7 @@ class _Fragment:
     file: Path | None = None
 
     def read(self) -> trimesh.Trimesh | np.ndarray:
-        return self.fuse() if self.file is None else read_geometry(self.file)
+        return self.fuse() if self.file is None else read_object(self.file)
 
     def fuse(self) -> np.ndarray:
         return fuse_frames(self.frames, self.intrinsics)

@@ -1,7 +1,8 @@
 """Learned rigid registration of two partial point clouds, in JAX and Flax; CMIGNet (Xie et al., RA-L 2023) is the flagship network.
 
-`load` reads a trained network from a run folder or a weights file, and `register` aligns two clouds with it; `cmig register` does the
-same for two files. `Config` holds the flags of a run, `RigidTransform` is the pose. `docs/architecture.md` describes the package.
+`register` aligns two clouds and says whether the result, a `Registration`, can be trusted; `cmig register` does the same for two files.
+`load` reads a trained network from a run folder or a weights file. `Config` holds the flags of a run, `RigidTransform` is the pose.
+`docs/architecture.md` describes the package.
 """
 
 from typing import TYPE_CHECKING, Any
@@ -11,9 +12,10 @@ from cmig_jax.config import Config
 if TYPE_CHECKING:
     from cmig_jax.inference.load import Network, load
     from cmig_jax.registration.register import register
+    from cmig_jax.registration.result import Registration
     from cmig_jax.transform import RigidTransform
 
-__all__ = ["Config", "Network", "RigidTransform", "load", "register"]
+__all__ = ["Config", "Network", "Registration", "RigidTransform", "load", "register"]
 
 
 def __getattr__(name: str) -> Any:
@@ -22,6 +24,8 @@ def __getattr__(name: str) -> Any:
         from cmig_jax.inference import load as module
     elif name == "register":
         from cmig_jax.registration import register as module
+    elif name == "Registration":
+        from cmig_jax.registration import result as module
     elif name == "RigidTransform":
         from cmig_jax import transform as module
     else:

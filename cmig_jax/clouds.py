@@ -28,7 +28,7 @@ def check_cloud(points: ArrayLike, name: object = "points", fewest: int = 1) -> 
     except ValueError as error:
         raise ValueError(f"{name}: expected [N, 3] numbers ({error})") from error
     if given.ndim != 2 or given.shape[1] != 3 or given.dtype.kind not in "fiu":
-        raise ValueError(f"{name}: shape {given.shape}, {given.dtype}; expected [N, 3] real numbers")
+        raise ValueError(f"{name}: shape {given.shape}, {given.dtype}; expected [N, 3] real numbers{_remedy(given)}")
     if len(given) < fewest:
         raise ValueError(f"{name}: {len(given)} points; expected at least {fewest}")
     bad = np.flatnonzero(~np.isfinite(given).all(axis=1))
@@ -36,6 +36,15 @@ def check_cloud(points: ArrayLike, name: object = "points", fewest: int = 1) -> 
         count = f"{len(bad)} of {len(given)} points"
         raise ValueError(f"{name}: point {bad[0]} is {given[bad[0]].tolist()}; expected finite coordinates ({count} have others)")
     return np.ascontiguousarray(given, np.float64)
+
+
+def _remedy(given: np.ndarray) -> str:
+    """Say what to pass instead, where that is clear."""
+    if given.ndim == 3 and given.shape[-1] == 3:
+        return ": pass cloud.reshape(-1, 3)"
+    if given.ndim == 2 and given.shape[1] > 3 and given.shape[0] != 3:
+        return ": pass cloud[:, :3]"
+    return ": pass cloud.T" if given.ndim == 2 and given.shape[0] == 3 else ""
 
 
 def thinned(points: NDArray[Number], count: int, seed: int = 0) -> NDArray[Number]:

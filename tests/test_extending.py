@@ -177,7 +177,7 @@ def test_it_is_exported_loaded_and_registers(run, tmp_path):
     network = load(tmp_path / "toy.npz")
     assert network.title == "Toy"
     target = np.random.default_rng(0).normal(size=(200, 3)) * [1, 0.6, 0.3]
-    pose = register(target - [0.05, 0, 0], target, network)
+    pose = register(target - [0.05, 0, 0], target, network).target_from_source
     np.testing.assert_allclose(pose.R @ pose.R.T, np.eye(3), atol=1e-6)
     np.save(tmp_path / "cloud.npy", target)
     assert cmig("register", tmp_path / "cloud.npy", tmp_path / "cloud.npy", "--network", run, "--transform", tmp_path / "T.txt") == 0

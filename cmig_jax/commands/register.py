@@ -1,11 +1,12 @@
-"""`cmig register SOURCE TARGET [--transform FILE.txt] [--aligned FILE.ply] [--picture FILE.png]`."""
+"""`cmig register SOURCE TARGET [--transform FILE] [--aligned FILE] [--picture FILE.png]`."""
 
 from __future__ import annotations
 
 import io
+import json
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Literal
+from typing import TYPE_CHECKING, Literal
 
 import numpy as np
 import trimesh
@@ -13,84 +14,127 @@ from tyro.conf import Positional
 
 from cmig_jax.commands.parsing import parser_of
 
+if TYPE_CHECKING:
+    from cmig_jax.data.geometry_files import GeometryFile
+    from cmig_jax.registration.result import Registration
+
 POINTS_ON_A_MESH = 10_000
 MOST_DRAWN = 2_000
-OUTPUTS = {"transform": (".txt",), "aligned": (".ply", ".npy"), "picture": (".png", ".pdf", ".svg")}
+OUTPUTS = {"transform": (".txt", ".json", ".npy"), "picture": (".png", ".pdf", ".svg")}
 
 
 @dataclass(frozen=True)
 class Command:
-    """Find the rigid transform that takes a source onto a target; print it, and write the files that are asked for."""
+    """Find the rigid transform that takes a source onto a target; print it and whether it can be trusted, and write files.
+
+    The exit code is 0 if the transform is trusted, 1 if it is not (files are written all the same), 2 for bad input.
+    """
 
     source: Positional[Path]
-    """Cloud or mesh (PLY, NPY `[N, 3]`, OFF, OBJ, STL), in any unit. Of a mesh, points on its surface are registered."""
+    """Cloud (PLY, PCD, XYZ, TXT, CSV, ASC, PTS, LAS, LAZ, NPY, NPZ, BIN) or mesh (PLY, OFF, OBJ, STL, GLB, 3MF), also with .gz, in any
+    unit. Of a mesh, points on its surface are registered."""
     target: Positional[Path]
     """The other one, in the same unit."""
     network: Path | None = None
-    """Run folder or weights file; by default the network that comes with the package."""
-    points: int | None = None
-    """Points per cloud that the network reads at most; by default as many as it was trained on."""
+    """Run folder or weights file of a network whose pose is one more start of the search."""
+    rotations: float | None = None
+    """Largest angle of the rotation in degrees, if it is known."""
     refine: bool = True
-    """Refine the pose by (generalised) ICP on the whole clouds."""
+    """Without it, the result is the network's pose as it is."""
     transform: Path | None = None
-    """Text file for target_from_source, a 4 x 4 matrix."""
+    """File for target_from_source, a 4 x 4 matrix (TXT, NPY), or with the verdict (JSON)."""
     aligned: Path | None = None
-    """File for the source in the target's frame: PLY (single precision), or NPY of its points."""
+    """File for the source in the target's frame, in any of these formats; in the source's own it keeps colours and other attributes."""
+    drop_invalid: bool = False
+    """Leave out points whose coordinates are not finite; otherwise they are an error."""
     picture: Path | None = None
     """Picture of both before and after: PNG, PDF or SVG."""
     up: Literal["x", "y", "z"] = "z"
     """Axis that points upward in the picture."""
+    json: bool = False
+    """Print the result as JSON and nothing else."""
+    quiet: bool = False
+    """Print nothing."""
 
 
 parse = parser_of(Command)
 
 
 def run(command: Command) -> int:
-    """Register, print the transform and the distances before and after, and write the files.
+    """Register, print the result, and write the files; return 1 if it is not trusted.
 
     Raises:
         ValueError: a file that cannot be read or has no format to write, or clouds that `register` refuses; the message names it.
     """
-    from scipy.spatial import KDTree
-
-    from cmig_jax.compilation import keep_compiled_programs
-    from cmig_jax.data.geometry_files import read_geometry
-    from cmig_jax.inference.load import load
+    from cmig_jax.data.geometry_files import SUFFIXES, read_geometry, suffix_of
     from cmig_jax.registration.register import register
 
     for name, path in (("transform", command.transform), ("aligned", command.aligned), ("picture", command.picture)):
-        if path is not None and (path.suffix.lower() not in OUTPUTS[name] or not path.parent.is_dir()):
-            raise ValueError(f"--{name} {path}: expected a file of {', '.join(OUTPUTS[name])} in an existing folder")
-    geometry = read_geometry(command.source)
-    source, target = _points(geometry, seed=0), _points(read_geometry(command.target), seed=1)
-    keep_compiled_programs()
-    network = None if command.network is None else load(command.network)
-    print(f"{command.source}: {len(source)} points; {command.target}: {len(target)} points", flush=True)
-    found = register(source, target, network, points=command.points, refine=command.refine)
-    moved, tree = found.apply(source), KDTree(target)
-    before, after = (np.median(tree.query(cloud)[0]) for cloud in (source, moved))
-    matrix = _as_text(found.as_matrix())
-    print(f"target_from_source:\n{matrix}")
-    print(f"a rotation by {np.degrees(found.angle()):.2f} degrees")
-    print(f"from a source point to the nearest target point, median: {before:.4g} before, {after:.4g} after")
-    _write(command, geometry, found.as_matrix(), matrix)
+        suffixes = SUFFIXES if name == "aligned" else OUTPUTS[name]
+        suffix = None if path is None else suffix_of(path) if name == "aligned" else path.suffix.lower()
+        if path is not None and (suffix not in suffixes or not path.parent.is_dir()):
+            raise ValueError(f"--{name} {path}: expected a file of {', '.join(suffixes)} in an existing folder")
+    files = [read_geometry(path, "drop" if command.drop_invalid else "error") for path in (command.source, command.target)]
+    source, target = (_points(file.geometry, seed) for seed, file in enumerate(files))
+    say = (lambda text: None) if command.quiet or command.json else print
+    for file in files:
+        if file.dropped:
+            say(f"{file.path}: {file.dropped} points left out that are not finite")
+    say(f"{command.source}: {len(source)} points; {command.target}: {len(target)} points")
+    if command.network is not None:
+        from cmig_jax.compilation import keep_compiled_programs
+
+        keep_compiled_programs()
+    limit = "any" if command.rotations is None else command.rotations
+    found = register(source, target, command.network, rotations=limit, refine=command.refine)
+    say(str(found))
+    if command.json:
+        print(_as_json(found))
+    _write(command, files[0], found)
     if command.picture is not None:
         from cmig_jax.report.plots import plot_pairs
 
         shown = [cloud[:: 1 + len(cloud) // MOST_DRAWN] for cloud in (source, target)]
-        pair = {"source": shown[0], "target": shown[1], "R": found.R, "t": found.t, "title": command.source.name}
+        pose = found.target_from_source
+        pair = {"source": shown[0], "target": shown[1], "R": pose.R, "t": pose.t, "title": command.source.name}
         plot_pairs([pair], command.picture, up=command.up)
-    return 0
+    return int(not found.trusted)
 
 
-def _write(command: Command, geometry: trimesh.Trimesh | np.ndarray, target_from_source: np.ndarray, matrix: str) -> None:
-    from cmig_jax.files import replacing, write_text
+def _write(command: Command, source: GeometryFile, found: Registration) -> None:
+    from cmig_jax.data.geometry_files import write_moved
+    from cmig_jax.files import replacing
 
     if command.transform is not None:
-        write_text(command.transform, f"{matrix}\n")
+        with replacing(command.transform) as file:
+            file.write(_transform_file(command.transform.suffix.lower(), found))
     if command.aligned is not None:
-        with replacing(command.aligned) as file:
-            file.write(_in_format(command.aligned, geometry, target_from_source))
+        write_moved(command.aligned, source, found.matrix)
+
+
+def _transform_file(suffix: str, found: Registration) -> bytes:
+    if suffix == ".json":
+        return f"{_as_json(found)}\n".encode()
+    written = io.BytesIO()
+    if suffix == ".npy":
+        np.save(written, found.matrix)
+    else:
+        np.savetxt(written, found.matrix, fmt="%20.12g")
+    return written.getvalue()
+
+
+def _as_json(found: Registration) -> str:
+    values = {
+        "target_from_source": found.matrix.tolist(),
+        "trusted": found.trusted,
+        "why": found.why,
+        "confidence": found.confidence,
+        "overlap": found.overlap,
+        "inlier_rmse": found.inlier_rmse,
+        "alternatives": [pose.as_matrix().tolist() for pose in found.alternatives],
+        "seconds": found.seconds,
+    }
+    return json.dumps(values, indent=1)
 
 
 def _points(geometry: trimesh.Trimesh | np.ndarray, seed: int) -> np.ndarray:
@@ -100,22 +144,3 @@ def _points(geometry: trimesh.Trimesh | np.ndarray, seed: int) -> np.ndarray:
     if isinstance(geometry, np.ndarray):
         return geometry
     return sample_surface(geometry, POINTS_ON_A_MESH, np.random.default_rng(seed))
-
-
-def _as_text(matrix: np.ndarray) -> str:
-    written = io.StringIO()
-    np.savetxt(written, matrix, fmt="%20.12g")
-    return written.getvalue().rstrip("\n")
-
-
-def _in_format(path: Path, geometry: trimesh.Trimesh | np.ndarray, target_from_source: np.ndarray) -> bytes:
-    """Write a moved geometry as the file's suffix says."""
-    moved = trimesh.PointCloud(geometry) if isinstance(geometry, np.ndarray) else geometry.copy()
-    moved.apply_transform(target_from_source)
-    if path.suffix.lower() == ".ply":
-        from trimesh.exchange.ply import export_ply
-
-        return export_ply(moved)
-    written = io.BytesIO()
-    np.save(written, np.asarray(moved.vertices))
-    return written.getvalue()

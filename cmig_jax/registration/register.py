@@ -191,7 +191,7 @@ def _refined(dense: tuple[Level, Level], fine: tuple[Level, Level], candidate: s
     refined, information = search.refine(*dense, candidate.matrix, rounds, threads)
     measured = fit(*fine, refined)
     if max(len(level.points) for level in dense) <= MOST_SHARED:
-        by_points, _ = search.refine(*dense, refined, rounds, threads, "ICP")
+        by_points, _ = search.refine(*dense, refined, rounds, threads, "ICP", tolerance=1e-7)
         if fit(*fine, by_points).rmse < measured.rmse / 2:
             return by_points, information
     return (candidate.matrix if measured.cost > candidate.fit.cost + verdict.CLOSE else refined), information

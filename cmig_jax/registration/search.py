@@ -55,6 +55,7 @@ def refine(
     rounds: Sequence[tuple[float, int]],
     threads: int = 1,
     kind: Literal["GICP", "ICP"] = "GICP",
+    tolerance: float = 1e-3,
 ) -> tuple[Floats, Floats]:
     """Refine a pose by generalised or point-to-point ICP, one round per (cutoff, iterations).
 
@@ -73,8 +74,8 @@ def refine(
             max_correspondence_distance=cutoff,
             num_threads=threads,
             max_iterations=iterations,
-            rotation_epsilon=1e-3,
-            translation_epsilon=1e-3,
+            rotation_epsilon=tolerance,
+            translation_epsilon=tolerance,
         )
         if found.num_inliers > 0 and np.isfinite(found.T_target_source).all():
             pose, information = np.array(found.T_target_source), np.array(found.H)
@@ -87,7 +88,7 @@ def find(coarse: tuple[Level, Level], fine: tuple[Level, Level], starts: Sequenc
     Args:
         coarse, fine: source and target.
         starts: poses to start from.
-        limit_deg: poses that turn by more (and `SAME_ANGLE_DEG`) are left out, unless all do.
+        limit_deg: poses that turn by more (and `SAME_ANGLE_DEG`) are left out; if all do, the starts are the poses.
 
     Returns:
         Poses that differ, best fit first.
@@ -95,7 +96,7 @@ def find(coarse: tuple[Level, Level], fine: tuple[Level, Level], starts: Sequenc
     first = distinct([Candidate(found, fit(*coarse, found)) for found in (refine(*coarse, start, COARSE)[0] for start in starts)])
     refined = [(refine(*fine, candidate.matrix, FINE)[0], candidate.starts) for candidate in first[:KEPT]]
     within = [(found, count) for found, count in refined if _angle_deg(found) <= limit_deg + SAME_ANGLE_DEG]
-    return distinct([Candidate(found, fit(*fine, found), count) for found, count in within or refined])
+    return distinct([Candidate(found, fit(*fine, found), count) for found, count in within or [(start, 1) for start in starts]])
 
 
 def distinct(candidates: Sequence[Candidate]) -> list[Candidate]:

@@ -25,11 +25,13 @@ class Fit:
             partner's plane and to the partner, and with the angle between the normals.
         overlap: shares of the source's and of the target's points with a partner within two spacings.
         rmse: root mean square distance of those partners.
+        median: median distance of those partners.
     """
 
     cost: float
     overlap: tuple[float, float]
     rmse: float
+    median: float
 
 
 def fit(source: Level, target: Level, matrix: Floats) -> Fit:
@@ -41,11 +43,12 @@ def fit(source: Level, target: Level, matrix: Floats) -> Fit:
         _one_sided(moved, source.normals @ R.T, target, spacing), _one_sided(back, target.normals @ R, source, spacing), strict=True
     )
     near = [distance[np.isfinite(distance)] for distance in distances]
-    square = np.concatenate(near) ** 2
+    partners = np.concatenate(near)
     return Fit(
         cost=float(np.mean([cost.mean() for cost in costs])),
         overlap=(len(near[0]) / len(source.points), len(near[1]) / len(target.points)),
-        rmse=float(np.sqrt(square.mean())) if len(square) else float("inf"),
+        rmse=float(np.sqrt(np.mean(partners**2))) if len(partners) else float("inf"),
+        median=float(np.median(partners)) if len(partners) else float("inf"),
     )
 
 

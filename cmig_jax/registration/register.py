@@ -45,7 +45,7 @@ def register(
 
     The clouds may differ in size and density and may overlap in part. Generalised ICP starts from many rotations about the clouds'
     centres on few points; the poses that fit best are refined on more points, and the best of them on up to `MOST_POINTS`. The result
-    is a function of the clouds alone: neither of the order of their rows nor of chance.
+    is a function of the clouds alone, without chance, and not of the order of their rows (above `clouds.SORTED_UP_TO` rows up to rounding).
 
     Args:
         source: `[N, 3]` real numbers, or an object with `points` or `vertices`, in any unit.
@@ -184,15 +184,17 @@ def _pose_of_network(network: Any, frame: _Frame) -> RigidTransform:
 def _refined(dense: tuple[Level, Level], fine: tuple[Level, Level], candidate: search.Candidate) -> tuple[Floats, Floats]:
     """Refine the best pose on all points; keep it as it was if that fits worse.
 
-    Clouds that share their points fit better by point-to-point ICP: partners then lie at no more than half the distance.
+    Clouds that share most of their points fit better by point-to-point ICP: most partners are then at less than half the distance.
     """
-    rounds = [(min(LAST_CUTOFF, SPACINGS * max(level.spacing for level in dense)), LAST_ITERATIONS)]
+    spacing = max(level.spacing for level in dense)
+    rounds = [(min(LAST_CUTOFF, SPACINGS * spacing), LAST_ITERATIONS)]
     threads = os.cpu_count() or 1
     refined, information = search.refine(*dense, candidate.matrix, rounds, threads)
     measured = fit(*fine, refined)
     if max(len(level.points) for level in dense) <= MOST_SHARED:
-        by_points, _ = search.refine(*dense, refined, rounds, threads, "ICP", tolerance=1e-7)
-        if fit(*fine, by_points).rmse < measured.rmse / 2:
+        closer = [*rounds, (spacing / 4, LAST_ITERATIONS)]  # where points without a twin have no partner
+        by_points, _ = search.refine(*dense, refined, closer, threads, "ICP", tolerance=1e-7)
+        if fit(*fine, by_points).median < measured.median / 2:
             return by_points, information
     return (candidate.matrix if measured.cost > candidate.fit.cost + verdict.CLOSE else refined), information
 

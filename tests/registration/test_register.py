@@ -12,11 +12,13 @@ from cmig_jax.registration.search import rotations
 UTM = np.array([500_000.0, 5_000_000.0, 100.0])
 
 
-def surface(count, seed):
-    """Sample a body without symmetry: three boxes on one another."""
+BOXES = [[0, 0, 0, 2, 1, 0.5], [0.7, 0.3, 0.7, 0.5, 0.4, 0.9], [-0.6, -0.35, 0.4, 0.5, 0.3, 0.3]]
+
+
+def surface(count, seed, boxes=BOXES, shares=(0.6, 0.25, 0.15)):
+    """Sample boxes (middle and size) on one another; `BOXES` has no symmetry, and is far from its mirror image."""
     rng = np.random.default_rng(seed)
-    boxes = np.array([[0, 0, 0, 2, 1, 0.5], [0.7, 0.3, 0.7, 0.5, 0.4, 0.9], [-0.6, -0.35, 0.4, 0.5, 0.3, 0.3]])
-    box = boxes[rng.choice(3, count, p=[0.6, 0.25, 0.15])]
+    box = np.array(boxes)[rng.choice(len(boxes), count, p=shares)]
     points = rng.uniform(-0.5, 0.5, (count, 3))
     points[np.arange(count), rng.integers(0, 3, count)] = rng.choice([-0.5, 0.5], count)
     return box[:, :3] + points * box[:, 3:]
@@ -73,7 +75,7 @@ def test_the_result_depends_neither_on_the_order_of_rows_nor_on_chance(found):
 
 def test_clouds_that_share_their_points_are_aligned_precisely():
     np.testing.assert_allclose(register(SOURCE, SOURCE @ R.T + T).apply(SOURCE), SOURCE @ R.T + T, atol=1e-6)
-    np.testing.assert_allclose(register(SOURCE, SOURCE[:500] @ R.T + T).apply(SOURCE), SOURCE @ R.T + T, atol=3e-3)
+    np.testing.assert_allclose(register(SOURCE, SOURCE[:500] @ R.T + T).apply(SOURCE), SOURCE @ R.T + T, atol=1e-3)
 
 
 def test_the_clouds_are_left_alone(found):
@@ -166,6 +168,13 @@ UNTRUSTED = {
     "half the size": (0.5 * SOURCE, TARGET),
     "a thousandth of the size": (0.001 * SOURCE, TARGET),
 }
+
+
+@pytest.mark.xfail(reason="a limit that docs/choosing.md reports: such a body fits its mirror image almost as well as itself", strict=True)
+def test_a_mirrored_copy_of_a_nearly_symmetric_body_is_not_trusted():
+    low = [[0, 0, 0, 2, 1, 0.5], [0.7, 0.1, 0.5, 0.5, 0.4, 0.9], [-0.6, -0.3, 0.4, 0.3, 0.2, 0.3]]
+    body, again = (surface(count, seed, low, (0.6, 0.3, 0.1)) for count, seed in ((700, 0), (600, 1)))
+    assert not register(body * [-1, 1, 1], again @ R.T + T).trusted
 
 
 @pytest.mark.parametrize("name", UNTRUSTED)

@@ -8,7 +8,8 @@ from matplotlib.figure import Figure
 
 from cmig_jax.experiments.run import Results
 from cmig_jax.experiments.table import spread
-from cmig_jax.report.plots import INK, SOURCE, TARGET, save, style_axes
+from cmig_jax.report.colours import INK, SOURCE, TARGET
+from cmig_jax.report.plots import save, style_axes
 
 PANELS = (("rmse_r_deg", "RMSE(R), degrees", TARGET), ("mae_r_deg", "MAE(R), degrees", SOURCE))
 

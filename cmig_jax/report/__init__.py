@@ -1,1 +1,1 @@
-"""Pictures and pages of what was evaluated; nothing is measured here."""
+"""Pictures and pages of evaluations and registrations; the results they show are given."""

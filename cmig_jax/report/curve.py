@@ -14,7 +14,8 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from numpy.typing import NDArray
 
-from cmig_jax.report.plots import CORRECT, INK, SOURCE, TARGET, save, style_axes
+from cmig_jax.report.colours import CORRECT, INK, SOURCE, TARGET
+from cmig_jax.report.plots import save, style_axes
 
 TERMS = ("#7b6ba8", "#b5843c", "#5b8c85", "#2c5f8d", "#b0566b", "#6f6f6f", "#8a9a3b", "#c06f3a")
 """Colours of the terms of the loss, in the order of the log."""

@@ -21,7 +21,8 @@ from numpy.typing import ArrayLike, NDArray
 
 from cmig_jax.evaluation.errors import Errors
 from cmig_jax.evaluation.metrics import RECALL_DEG
-from cmig_jax.report.plots import FAINT, INK, save, style_axes
+from cmig_jax.report.colours import FAINT, INK
+from cmig_jax.report.plots import save, style_axes
 
 FLOOR, CEILING = 1e-3, 180.0
 NETWORKS = ("#3179b5", "#d9772b", "#3f9b6c", "#cf5c9e")

@@ -6,7 +6,6 @@ a coordinate by at most half of it. Arrays are little-endian, row by row, in bas
 
 from __future__ import annotations
 
-import base64
 import io
 from dataclasses import dataclass
 from typing import Any
@@ -20,6 +19,7 @@ from cmig_jax.clouds import thinned
 from cmig_jax.data.pairs import Pair
 from cmig_jax.evaluation.errors import Errors
 from cmig_jax.evaluation.matches import Matches
+from cmig_jax.report.parts import encoded
 from cmig_jax.report.plots import DEPTH
 
 LARGEST = 32767
@@ -101,7 +101,7 @@ def describe(example: Example, errors: Errors) -> dict[str, Any]:
 
 def quantise(points: ArrayLike, scale: float) -> str:
     """Return points `[P, 3]` as base64 of int16 multiples of `scale`."""
-    return base64.b64encode((np.asarray(points, np.float64) / scale).round().astype("<i2").tobytes()).decode()
+    return encoded((np.asarray(points, np.float64) / scale).round().astype("<i2"))
 
 
 def contact_sheet(views: NDArray[np.uint8]) -> tuple[bytes, int]:

@@ -1,18 +1,12 @@
-"""The report of an evaluation as one HTML page: it opens from a folder, without a server, and asks for nothing outside itself.
-
-`page.html` is the frame, `page.css` the looks, `viewer.js` draws pairs, `page.js` ties both to the controls; all are written into the
-page, with the pairs as JSON and the pictures as data. A content security policy in the page forbids every request.
-"""
+"""The report of an evaluation as one HTML page, made of `evaluation.html`, `.css` and `.js` and what pages share (`parts`)."""
 
 from __future__ import annotations
 
 import base64
-import json
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from html import escape
 from pathlib import Path
-from string import Template
 from typing import Any
 
 import numpy as np
@@ -26,10 +20,7 @@ from cmig_jax.evaluation.tables import html_table
 from cmig_jax.files import write_text
 from cmig_jax.report.figures import Drawn
 from cmig_jax.report.gallery import MAX_POINTS, Example, contact_sheet, describe
-from cmig_jax.report.plots import CORRECT, SOURCE, TARGET, WRONG
-
-TRUTH = "#7b6ba8"
-PARTS = Path(__file__).parent
+from cmig_jax.report.parts import html_page
 
 
 @dataclass(frozen=True)
@@ -57,9 +48,10 @@ class Report:
 
 def write_page(path: Path, report: Report) -> None:
     """Write the page."""
-    page = Template(_part("page.html")).substitute(
-        title=escape(f"{report.run}: evaluation"),
-        style=_style(),
+    page = html_page(
+        "evaluation",
+        f"{report.run}: evaluation",
+        {"network": report.errors.network, "pairs": [describe(e, report.errors) for e in report.examples]},
         run=escape(report.run),
         facts=_facts(report),
         table=html_table(report.results),
@@ -68,8 +60,6 @@ def write_page(path: Path, report: Report) -> None:
         pairs_note=escape(_pairs_note(report)),
         pairs="\n".join(_pair(example, number, report) for number, example in enumerate(report.examples, start=1)),
         figures="\n".join(_figure(figure) for figure in report.figures),
-        data=_embedded({"network": report.errors.network, "pairs": [describe(e, report.errors) for e in report.examples]}),
-        script=f"{_part('viewer.js')}\n{_part('page.js')}",
     )
     write_text(path, page)
 
@@ -86,17 +76,9 @@ def protocol(config: Config, pairs: int) -> str:
     crop = "no crop" if data.crop == "none" else f"{data.crop} crop to {data.keep:.0%}"
     noise = f"noise {data.noise_std:g} clipped at {data.noise_clip:g}" if data.noise_std > 0 else "no noise"
     turn = " to either side" if data.turn == "either" else ""
-    pose = f"rotations up to {data.max_angle_deg:g}° per axis{turn}, translations up to {data.max_translation:g}"
+    rotations = "any rotation" if data.turn == "any" else f"rotations up to {data.max_angle_deg:g}° per axis{turn}"
+    pose = f"{rotations}, translations up to {data.max_translation:g}"
     return f"{data.source}, {categories}, {pairs} pairs; {data.points} points sampled {data.sampling}, {crop}, {noise}; {pose}{shown}"
-
-
-def _part(name: str) -> str:
-    return (PARTS / name).read_text()
-
-
-def _style() -> str:
-    colours = {"source": SOURCE, "target": TARGET, "right": CORRECT, "wrong": WRONG, "truth": TRUTH}
-    return f":root {{ {' '.join(f'--{name}: {colour};' for name, colour in colours.items())} }}\n{_part('page.css')}"
 
 
 def _facts(report: Report) -> str:
@@ -197,8 +179,3 @@ def _figure(figure: Drawn) -> str:
     heading = escape(figure.heading)
     picture = f'<div class="drawing" role="img" aria-label="{heading}">{figure.svg}</div>'
     return f"<figure><h3>{heading}</h3>{picture}<figcaption>{escape(figure.caption)}</figcaption></figure>"
-
-
-def _embedded(data: Any) -> str:
-    """Write JSON that no script element ends early for: a name may hold anything."""
-    return json.dumps(data, separators=(",", ":")).replace("<", "\\u003c")

@@ -20,11 +20,9 @@ from mpl_toolkits.mplot3d.art3d import Line3DCollection
 from numpy.typing import ArrayLike
 
 from cmig_jax.files import replacing_path
+from cmig_jax.report.colours import CORRECT, FAINT, INK, SOURCE, TARGET, WRONG
 
 DPI = 150
-INK, FAINT = "#2b2b2b", "#9a9a9a"
-SOURCE, TARGET = "#dd7a2f", "#2c5f8d"
-CORRECT, WRONG = "#3f9b6c", "#a3213f"
 DEPTH = ("#d3e0e9", "#7fa6c1", "#346a90", "#0f2c44")
 MAX_LINES = 40
 

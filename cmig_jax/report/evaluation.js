@@ -1,7 +1,6 @@
 // The pairs of the page and its controls.
 
-const data = JSON.parse(document.getElementById("data").textContent);
-const control = (id) => document.getElementById(id);
+const data = JSON.parse(control("data").textContent);
 const visible = new Set();
 let waiting = false;
 
@@ -11,23 +10,23 @@ const cards = [...document.querySelectorAll(".pair")].map((element, i) => card(e
 function card(element, stored) {
   const { scale, truth, poses } = stored;
   const [source, target] = [points(stored.source, scale), points(stored.target, scale)];
-  const frame = bounds(source, target, moved(source, truth));
   const matches = stored.matches && readMatches(stored.matches, scale);
   const view = camera();
+  const frame = bounds(view, source, target, moved(source, truth));
   const canvases = [...element.querySelectorAll("canvas")];
   const caption = canvases[1].parentElement.querySelector("figcaption");
   const rows = [...element.querySelectorAll("[data-method]")];
   const drawAll = () => {
     const shown = controls();
-    const colour = colours();
+    const colour = colours("source", "target", "right", "wrong", "truth");
     const pose = poses[shown.method];
     for (const row of rows) row.classList.toggle("shown", row.dataset.method === shown.method);
     caption.textContent = `after ${shown.method}`;
     for (const canvas of canvases) {
       const place = canvas.dataset.when === "after" ? (cloud) => moved(cloud, pose) : (cloud) => cloud;
       const scene = { frame, clouds: [], lines: [], dots: [] };
-      if (shown.truth && canvas.dataset.when === "after") scene.clouds.push({ points: moved(source, truth), colour: colour.truth, hollow: true });
-      scene.clouds.push({ points: target, colour: colour.target }, { points: place(source), colour: colour.source });
+      if (shown.truth && canvas.dataset.when === "after") scene.clouds.push({ points: moved(source, truth), colours: [colour.truth], hollow: true });
+      scene.clouds.push({ points: target, colours: [colour.target] }, { points: place(source), colours: [colour.source] });
       if (matches) addMatches(scene, matches, place, shown, colour);
       draw(canvas, view, scene);
     }
@@ -63,11 +62,6 @@ function controls() {
   return { method: control("method").value, ...Object.fromEntries(ticked) };
 }
 
-function colours() {
-  const style = getComputedStyle(document.documentElement);
-  return Object.fromEntries(["source", "target", "right", "wrong", "truth"].map((name) => [name, style.getPropertyValue(`--${name}`).trim()]));
-}
-
 /** Draw cards once before the next frame; those out of sight when they come into it. */
 const stale = new Set();
 function redraw(items) {
@@ -100,7 +94,7 @@ for (const id of ["correspondences", "keypoints"]) {
   control(id).checked &&= anyMatches;
 }
 function changed() {
-  for (const entry of document.querySelectorAll("[data-with]")) entry.hidden = !control(entry.dataset.with).checked;
+  showKey();
   redraw(cards);
 }
 for (const id of ["method", "correspondences", "keypoints", "truth"]) control(id).addEventListener("change", changed);

@@ -40,6 +40,8 @@ def check_cloud(points: ArrayLike, name: object = "points", fewest: int = 1) -> 
 
 def _remedy(given: np.ndarray) -> str:
     """Say what to pass instead, where that is clear."""
+    if {"x", "y", "z"} <= set(given.dtype.names or ()):
+        return ': pass np.stack([cloud["x"], cloud["y"], cloud["z"]], axis=-1)'
     if given.ndim == 3 and given.shape[-1] == 3:
         return ": pass cloud.reshape(-1, 3)"
     if given.ndim == 2 and given.shape[1] > 3 and given.shape[0] != 3:

@@ -20,7 +20,7 @@ Categories = Literal["all", "first-half", "second-half"]
 Kernels = Literal["auto", "plain", "fast"]
 Sampling = Literal["once", "twice", "subsets"]
 Crop = Literal["shared", "independent", "half-space", "none"]
-Turn = Literal["positive", "either"]
+Turn = Literal["positive", "either", "any"]
 Layout = Literal["dodecahedron", "ring", "axes"]
 Rule = tuple[str, bool, str]
 """A flag and its value, whether it is valid, and what was expected."""
@@ -87,7 +87,8 @@ class DataConfig:
     max_angle_deg: float = 45.0
     """Each of the three Euler angles is uniform in [0, this], degrees (Sec. IV-B)."""
     turn: Turn = "positive"
-    """`positive`: angles as above; `either`: uniform in [-max_angle_deg, max_angle_deg]."""
+    """`positive`: angles as above; `either`: uniform in [-max_angle_deg, max_angle_deg]; `any`: every rotation alike, whatever
+    max_angle_deg."""
     max_translation: float = 0.5
     """Each translation component is uniform in [-this, this], object units (Sec. IV-B)."""
     validation: float = 0.1

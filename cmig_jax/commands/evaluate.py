@@ -36,6 +36,8 @@ class Command:
     """Evaluate on this many test pairs, evenly spaced, instead of all."""
     batch: int = 16
     """Pairs per call of the network."""
+    search: tuple[Literal["any", "bound"], ...] = ()
+    """Rows of `register`, about a second a pair: `any` knows nothing about the rotation, `bound` its largest angle in the protocol."""
     out: str = "evaluation"
     """Name of the folder for the results, inside the run folder; for a weights file inside runs/NAME-weights."""
     report: bool = False
@@ -98,7 +100,15 @@ def run(parsed: Parsed) -> int:
     checkpoint = f"{which}, step {network.step}" if is_run else f"{path.name}, step {network.step}"
     name = path.resolve().name if is_run else path.stem
     folder = (path if is_run else Path("runs") / f"{name}-weights") / command.out
-    evaluation = evaluate_network(network, folder, command=parsed.typed, checkpoint=checkpoint, limit=command.limit, batch=command.batch)
+    evaluation = evaluate_network(
+        network,
+        folder,
+        command=parsed.typed,
+        checkpoint=checkpoint,
+        limit=command.limit,
+        batch=command.batch,
+        search=command.search,
+    )
     print(text_table(evaluation.results))
     draw(evaluation, path / "log.jsonl" if is_run else None)
     for row, reason in baselines.missing().items():

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import itertools
+
 import numpy as np
 from scipy.spatial.transform import Rotation
 
@@ -59,7 +61,12 @@ def samplings(points: np.ndarray, count: int, sampling: Sampling, name: object, 
 def random_pose(
     rng: np.random.Generator, max_angle_deg: float, max_translation: float, turn: Turn = "positive"
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Draw R = Rx Ry Rz `[3, 3]`, each angle uniform in [0 or -max, max] degrees, and t `[3]` uniform in [-max, max]."""
+    """Draw R = Rx Ry Rz `[3, 3]`, each angle uniform in [0 or -max, max] degrees, and t `[3]` uniform in [-max, max].
+
+    With turn = any, R is uniform over all rotations.
+    """
+    if turn == "any":
+        return Rotation.from_quat(rng.normal(size=4)).as_matrix(), rng.uniform(-max_translation, max_translation, 3)
     x, y, z = rng.uniform(-max_angle_deg if turn == "either" else 0, max_angle_deg, 3)
     R = Rotation.from_euler("zyx", [z, y, x], degrees=True).as_matrix()
     return R, rng.uniform(-max_translation, max_translation, 3)
@@ -67,7 +74,17 @@ def random_pose(
 
 def mean_angle_deg(data: DataConfig) -> float:
     """Return the mean of each of the three angles that `random_pose` draws; 0 for recorded pairs, whose angles have either sign."""
-    return 0.0 if data.turn == "either" or source_of(data).records else data.max_angle_deg / 2
+    return data.max_angle_deg / 2 if data.turn == "positive" and not source_of(data).records else 0.0
+
+
+def largest_rotation_deg(data: DataConfig) -> float:
+    """Return the largest angle of a rotation that `random_pose` draws; of recorded pairs, of those that are kept."""
+    if source_of(data).records:
+        return data.max_angle_deg
+    if data.turn == "any" or data.max_angle_deg > 90:
+        return 180.0
+    corners = itertools.product((-data.max_angle_deg if data.turn == "either" else 0, data.max_angle_deg), repeat=3)
+    return float(np.degrees(Rotation.from_euler("zyx", list(corners), degrees=True).magnitude()).max())
 
 
 def crop(source: np.ndarray, target: np.ndarray, kind: Crop, keep: float, rng: np.random.Generator) -> tuple[np.ndarray, np.ndarray]:

@@ -13,6 +13,8 @@ from cmig_jax.clouds import check_cloud
 Floats = NDArray[np.float64]
 FEWEST = 10
 """Fewest different points: a covariance needs neighbours that lie on a surface."""
+FAR = 1_000
+"""Points farther away than so many median distances from the median point are left out: no return, or a failed match of a sensor."""
 SORTED_UP_TO = 200_000
 """Larger clouds are thinned first, which merges duplicates and does not depend on the order of rows."""
 STEPS = 200
@@ -24,7 +26,7 @@ class UserCloud:
     """A cloud that was checked.
 
     Attributes:
-        points: `[N, 3]` float64, different rows, in an order that does not depend on the order of the rows given.
+        points: `[N, 3]` float64, different rows and none `FAR` away, in an order that does not depend on the order of the rows given.
         rows: `[N]`, where they stand in what was given.
         dropped: rows left out because they are not finite.
         centre: `[3]`, mean of the points without stray ones.
@@ -58,12 +60,13 @@ def user_cloud(given: Any, name: str, invalid: Literal["error", "drop"] = "error
     if invalid == "drop" and given.ndim == 2 and given.dtype.kind == "f":
         rows = np.flatnonzero(np.isfinite(given).all(axis=1))
     dropped = (len(given) if given.ndim else 0) - len(rows)
-    points = check_cloud(given[rows] if dropped else given, name, FEWEST)
-    if len(points) <= SORTED_UP_TO:
-        points, first = np.unique(points, axis=0, return_index=True)
-        rows = rows[first]
+    points = check_cloud(given[rows] if dropped else given, name, 0)
+    kept = _different(points)
+    kept = kept[_near(points[kept])] if len(kept) >= FEWEST else kept
+    points, rows = points[kept], rows[kept]
     if len(points) < FEWEST:
-        raise ValueError(f"{name}: {len(points)} different points; expected at least {FEWEST}")
+        known = "if it is known which points belong together, three pairs fix a pose: scipy's Rotation.align_vectors"
+        raise ValueError(f"{name}: {len(points)} different points; expected at least {FEWEST} ({known})")
     _check_shape(points, given.dtype, name)
     centre, radius = _robust(points)
     return UserCloud(points, rows, dropped, centre, radius)
@@ -80,6 +83,20 @@ def _as_array(given: Any) -> np.ndarray:
             if hasattr(given, attribute):
                 return np.asarray(getattr(given, attribute))
     return given if isinstance(given, np.ndarray) else np.asarray(given)
+
+
+def _different(points: Floats) -> NDArray[np.int64]:
+    """Return positions without those of repeated points; of large clouds, only the origin (no return of a sensor) is not repeated."""
+    if len(points) <= SORTED_UP_TO:
+        return np.unique(points, axis=0, return_index=True)[1]
+    at_origin = ~points.any(axis=1)
+    return np.flatnonzero(~at_origin | (np.cumsum(at_origin) == 1))
+
+
+def _near(points: Floats) -> NDArray[np.bool_]:
+    with np.errstate(over="ignore"):
+        distance = np.linalg.norm(points - np.median(points, axis=0), axis=1)
+    return distance <= FAR * (np.median(distance) or np.inf)
 
 
 def _check_shape(points: Floats, dtype: np.dtype, name: str) -> None:

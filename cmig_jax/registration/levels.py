@@ -13,6 +13,7 @@ from scipy.spatial import KDTree
 Floats = NDArray[np.float64]
 NORMAL_NEIGHBOURS, COVARIANCE_NEIGHBOURS = 12, 20
 GROWTH = 1.12
+BEYOND = 1e3
 
 
 @dataclass(frozen=True)
@@ -31,26 +32,31 @@ class Level:
         return KDTree(self.points)
 
     @functools.cached_property
-    def _neighbours(self) -> tuple[Floats, NDArray[np.int64]]:
+    def neighbours(self) -> tuple[Floats, NDArray[np.int64]]:
+        """Distances and positions `[N, k]` of the nearest points, each itself first."""
         distances, index = self.tree.query(self.points, k=min(NORMAL_NEIGHBOURS, len(self.points)), workers=-1)
         return distances, np.asarray(index)
 
     @functools.cached_property
     def spacing(self) -> float:
         """Median distance from a point to the nearest other one."""
-        return float(np.median(self._neighbours[0][:, 1]))
+        return float(np.median(self.neighbours[0][:, 1]))
 
     @functools.cached_property
     def normals(self) -> Floats:
         """Normals `[N, 3]` of the plane through each point's neighbours, of either sign."""
-        around = self.points[self._neighbours[1]]
+        around = self.points[self.neighbours[1]]
         around = around - around.mean(axis=1, keepdims=True)
         return np.linalg.eigh(np.einsum("nki,nkj->nij", around, around))[1][:, :, 0]
 
     @functools.cached_property
     def prepared(self) -> tuple[small_gicp.PointCloud, small_gicp.KdTree]:
-        """The cloud with covariances, and its tree, as small_gicp takes them."""
-        cloud = small_gicp.PointCloud(self.points)
+        """The cloud with covariances, and its tree, as small_gicp takes them.
+
+        It prints a warning about clouds of 10 points or fewer, every time; to these a point is added beyond all cutoffs.
+        """
+        added = [[BEYOND, BEYOND, BEYOND]] if len(self.points) <= 10 else np.zeros((0, 3))
+        cloud = small_gicp.PointCloud(np.concatenate([self.points, added]))
         tree = small_gicp.KdTree(cloud)
         small_gicp.estimate_covariances(cloud, tree, num_neighbors=min(COVARIANCE_NEIGHBOURS, len(self.points)), num_threads=1)
         return cloud, tree

@@ -2,10 +2,7 @@
 
 from __future__ import annotations
 
-import os
 import time
-from collections.abc import Sequence
-from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Literal
 
@@ -14,19 +11,23 @@ from numpy.typing import NDArray
 from scipy.spatial import KDTree
 
 from cmig_jax.registration import search, verdict
-from cmig_jax.registration.clouds import UserCloud, user_cloud
+from cmig_jax.registration.clouds import user_cloud
 from cmig_jax.registration.fit import fit
-from cmig_jax.registration.levels import Level, grid_means
+from cmig_jax.registration.frame import Frame
+from cmig_jax.registration.levels import Level
 from cmig_jax.registration.result import Registration
-from cmig_jax.transform import RigidTransform, check_transform
+from cmig_jax.transform import RigidTransform
 
 Floats = NDArray[np.float64]
-COARSE_POINTS, FINE_POINTS, MOST_POINTS = 250, 1_200, 100_000
-NEAR_DEG = 25.0
-"""How far around a given start rotations are tried."""
+MOST_POINTS = 100_000
+LEVELS = (MOST_POINTS, 1_200, 250)
+"""Most points of the clouds in the last refinement, in the choice of a pose, and in the search."""
+AXES = {"x": (1.0, 0.0, 0.0), "y": (0.0, 1.0, 0.0), "z": (0.0, 0.0, 1.0)}
 MOST_ALTERNATIVES = 8
 MOST_SHARED = 10_000
 """Larger clouds are not expected to share their points."""
+WORSE = 0.02
+"""The last refinement is dropped if the cost grows by more."""
 LAST_CUTOFF, SPACINGS, LAST_ITERATIONS = 0.05, 3.0, 30
 """Cutoff of the last refinement: so many spacings of the clouds, at most `LAST_CUTOFF`."""
 
@@ -37,7 +38,8 @@ def register(
     network: Any = None,
     *,
     init: RigidTransform | None = None,
-    rotations: Literal["any"] | float = "any",
+    rotations: Literal["any", "yaw"] | float = "any",
+    up: Literal["x", "y", "z"] = "z",
     refine: bool = True,
     invalid: Literal["error", "drop"] = "error",
 ) -> Registration:
@@ -51,8 +53,11 @@ def register(
         source: `[N, 3]` real numbers, or an object with `points` or `vertices`, in any unit.
         target: `[M, 3]`, in the same unit.
         network: of `load`, or its run folder or weights file: its pose is one more start.
-        init: a pose near the right one: only rotations within `NEAR_DEG` of it are tried.
-        rotations: largest angle of the rotation in degrees, if it is known: fewer starts, and fewer poses to mistake for the right one.
+        init: a pose near the right one: only rotations within `search.NEAR_DEG` of it are tried.
+        rotations: largest angle of the rotation in degrees, or `yaw` for turns about the vertical alone (a scanner that stands upright),
+            if that is known: fewer starts, and fewer poses to mistake for the right one. A pose may tilt the vertical by
+            `search.MOST_TILT_DEG`.
+        up: axis of the vertical in both clouds, for `yaw`.
         refine: without it, return the pose of the network as it is.
         invalid: `drop` leaves out rows that are not finite.
 
@@ -63,79 +68,45 @@ def register(
         ValueError: a cloud that is not `[N, 3]` numbers, not finite, with fewer than `clouds.FEWEST` different points or all points on one
             line; a network that does not fit the clouds; an argument out of range.
     """
-    limit = _checked_limit(rotations)
+    limit, vertical = _checked_limit(rotations, up)
     if not refine and network is None:
         raise ValueError("refine = False: expected a network, whose pose is then returned as it is")
     clock = _Clock()
-    frame = _Frame(user_cloud(source, "source", invalid), user_cloud(target, "target", invalid))
-    dense, fine, coarse = frame.levels((MOST_POINTS, FINE_POINTS, COARSE_POINTS))
+    frame = Frame(user_cloud(source, "source", invalid), user_cloud(target, "target", invalid))
+    dense, fine, coarse = frame.levels(LEVELS)
     clock.stage("clouds")
     starts = [] if network is None else [frame.normalised(_pose_of_network(network, frame))]
     clock.stage("network")
     if refine:
-        starts += _starts(limit, None if init is None else frame.normalised(init))
-        candidates = search.find(coarse, fine, starts, limit if init is None else 180.0)
+        starts += search.starts(limit, vertical, None if init is None else frame.normalised(init))
+        bound = (limit, vertical) if init is None else (180.0, None)
+        candidates = search.find(coarse, fine, starts, *bound)
         clock.stage("search")
-        best, information = _refined(dense, fine, candidates[0])
+        chosen, *others = verdict.weigh(*fine, candidates, limit)
+        clock.stage("choice")
+        best, information = _refined(dense, fine, chosen.candidate)
+        best = best if search.allowed(best, *bound) else chosen.candidate.matrix
     else:
-        candidates = [search.Candidate(starts[0], fit(*fine, starts[0]))]
+        chosen, *others = verdict.weigh(*fine, [search.Candidate(starts[0], fit(*fine, starts[0]))], limit)
         best, information = starts[0], np.zeros((6, 6))
     pairs = _correspondences(frame, best)
     clock.stage("refinement")
     measured = fit(*fine, best)
-    found = verdict.features([measured.cost, *(c.fit.cost for c in candidates[1:])], [c.starts for c in candidates], measured.overlap)
-    confidence = verdict.confidence(found)
-    close = [c for c in candidates[1:] if c.fit.cost < measured.cost + verdict.CLOSE]
+    confidence = verdict.confidence(chosen)
+    close = [each.candidate.matrix for each in others if each.probability > verdict.CLOSE * chosen.probability]
     return Registration(
         target_from_source=frame.original(best),
         trusted=confidence >= verdict.TRUSTED,
-        why=verdict.explain(found, frame.ratio),
+        why=verdict.explain(confidence, chosen, frame.ratio),
         confidence=confidence,
         overlap=measured.overlap,
         inlier_rmse=measured.rmse * frame.scale,
         correspondences=pairs,
         information=information,
-        alternatives=tuple(frame.original(c.matrix) for c in close[:MOST_ALTERNATIVES]),
+        alternatives=tuple(frame.original(matrix) for matrix in close[:MOST_ALTERNATIVES]),
         dropped=(frame.source.dropped, frame.target.dropped),
         seconds=clock.seconds,
     )
-
-
-@dataclass(frozen=True)
-class _Frame:
-    """Both clouds, and the normalised frame: each at its own centre, the larger of radius 1."""
-
-    source: UserCloud
-    target: UserCloud
-
-    @property
-    def scale(self) -> float:
-        return max(self.source.radius, self.target.radius)
-
-    @property
-    def ratio(self) -> float:
-        return self.scale / min(self.source.radius, self.target.radius)
-
-    def normalised_clouds(self) -> tuple[Floats, Floats]:
-        source, target = ((cloud.points - cloud.centre) / self.scale for cloud in (self.source, self.target))
-        return source, target
-
-    def levels(self, counts: Sequence[int]) -> list[tuple[Level, Level]]:
-        """Return both clouds with at most so many points, each level thinned from the one before."""
-        clouds, radii = self.normalised_clouds(), (self.source.radius / self.scale, self.target.radius / self.scale)
-        levels = []
-        for count in counts:
-            clouds = tuple(grid_means(cloud, count, radius) for cloud, radius in zip(clouds, radii, strict=True))
-            levels.append((Level(clouds[0]), Level(clouds[1])))
-        return levels
-
-    def normalised(self, pose: RigidTransform) -> Floats:
-        R, t = np.asarray(pose.R, np.float64), np.asarray(pose.t, np.float64)
-        return _matrix(R, (R @ self.source.centre + t - self.target.centre) / self.scale)
-
-    def original(self, matrix: Floats) -> RigidTransform:
-        R, t = matrix[:3, :3], matrix[:3, 3]
-        return check_transform(R, self.target.centre + self.scale * t - R @ self.source.centre, "register")
 
 
 class _Clock:
@@ -151,27 +122,20 @@ class _Clock:
         self.seconds[name], self._last = now - self._last, now
 
 
-def _checked_limit(rotations: Literal["any"] | float) -> float:
+def _checked_limit(rotations: Literal["any", "yaw"] | float, up: Literal["x", "y", "z"]) -> tuple[float, Floats | None]:
+    """Return the largest angle in degrees, and the axis `[3]` if there is only one."""
+    if up not in AXES:
+        raise ValueError(f"up = {up!r}: expected x, y or z")
+    if rotations == "yaw":
+        return 180.0, np.array(AXES[up])
     if rotations == "any":
-        return 180.0
+        return 180.0, None
     if isinstance(rotations, str) or not 0 <= rotations <= 180:
-        raise ValueError(f"rotations = {rotations!r}: expected any, or an angle of 0 to 180 degrees")
-    return float(rotations)
+        raise ValueError(f"rotations = {rotations!r}: expected any, yaw, or an angle of 0 to 180 degrees")
+    return float(rotations), None
 
 
-def _starts(limit: float, init: Floats | None) -> Sequence[Floats]:
-    if init is None:
-        return [_matrix(R, np.zeros(3)) for R in search.rotations(limit)]
-    return [_matrix(R @ init[:3, :3], init[:3, 3]) for R in search.rotations(min(limit, NEAR_DEG))]
-
-
-def _matrix(R: Floats, t: Floats) -> Floats:
-    matrix = np.eye(4)
-    matrix[:3, :3], matrix[:3, 3] = R, t
-    return matrix
-
-
-def _pose_of_network(network: Any, frame: _Frame) -> RigidTransform:
+def _pose_of_network(network: Any, frame: Frame) -> RigidTransform:
     from cmig_jax.inference.load import Network, load
     from cmig_jax.registration.network import network_pose
 
@@ -188,7 +152,7 @@ def _refined(dense: tuple[Level, Level], fine: tuple[Level, Level], candidate: s
     """
     spacing = max(level.spacing for level in dense)
     rounds = [(min(LAST_CUTOFF, SPACINGS * spacing), LAST_ITERATIONS)]
-    threads = os.cpu_count() or 1
+    threads = 1  # several add up in another order each time; on 100,000 points they would save 0.1 s
     refined, information = search.refine(*dense, candidate.matrix, rounds, threads)
     measured = fit(*fine, refined)
     if max(len(level.points) for level in dense) <= MOST_SHARED:
@@ -196,10 +160,10 @@ def _refined(dense: tuple[Level, Level], fine: tuple[Level, Level], candidate: s
         by_points, _ = search.refine(*dense, refined, closer, threads, "ICP", tolerance=1e-7)
         if fit(*fine, by_points).median < measured.median / 2:
             return by_points, information
-    return (candidate.matrix if measured.cost > candidate.fit.cost + verdict.CLOSE else refined), information
+    return (candidate.matrix if measured.cost > candidate.fit.cost + WORSE else refined), information
 
 
-def _correspondences(frame: _Frame, matrix: Floats) -> NDArray[np.int64]:
+def _correspondences(frame: Frame, matrix: Floats) -> NDArray[np.int64]:
     """Return points that are each other's nearest, `[n, 2]` positions in what was given; of large clouds, those of a part."""
     source, target = frame.normalised_clouds()
     steps = [1 + (len(cloud) - 1) // MOST_POINTS for cloud in (source, target)]

@@ -50,7 +50,7 @@ class Registration:
         return np.asarray(self.target_from_source.as_matrix())
 
     def apply(self, points: ArrayLike) -> Floats:
-        """Move points `[..., 3]` of the source's frame into the target's."""
+        """Move points `[..., N, 3]` of the source's frame into the target's."""
         return np.asarray(self.target_from_source.apply(np.asarray(points, np.float64)))
 
     def __str__(self) -> str:

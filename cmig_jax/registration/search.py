@@ -14,16 +14,27 @@ import small_gicp
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
+from cmig_jax.registration.evidence import turn_deg
 from cmig_jax.registration.fit import Fit, fit
+from cmig_jax.registration.frame import matrix_of
 from cmig_jax.registration.levels import Level
+from cmig_jax.registration.threads import in_order
 
 Floats = NDArray[np.float64]
+Rounds = Sequence[tuple[float, int]]
+NOT_MEASURED = Fit(np.inf, (0.0, 0.0), np.inf, np.inf)
 ROTATIONS = 400
 """Rotations that cover all turns; on training objects 1,000 find no more poses."""
 KEPT = 24
+NEAR_DEG = 25.0
+"""How far around a given start rotations are tried."""
 SAME_ANGLE_DEG, SAME_SHIFT = 8.0, 0.08
-COARSE, FINE = ((0.3, 15),), ((0.15, 20), (0.05, 30))
-"""Cutoff and iterations of each round of generalised ICP, on the coarse and on the fine points."""
+YAW_STEP_DEG, MOST_TILT_DEG = 10.0, 10.0
+"""Turns about the vertical: the step between those that are tried, and how far a pose may tilt it."""
+SLID, SLIDES = 6, (-0.4, -0.2, 0.2, 0.4)
+"""So many of the best poses are tried again, moved by so much along each principal axis of the target."""
+COARSE, NEAR, FINE = ((0.3, 15),), ((0.15, 15),), ((0.15, 20), (0.05, 30))
+"""Cutoff and iterations of each round of generalised ICP: on the coarse points, on those after a slide, and on the fine points."""
 
 
 @dataclass(frozen=True)
@@ -35,11 +46,15 @@ class Candidate:
     starts: int = 1
 
 
-def rotations(limit_deg: float) -> list[Floats]:
+def rotations(limit_deg: float, up: Floats | None = None) -> list[Floats]:
     """Return rotations `[3, 3]` spread evenly over those by at most `limit_deg`; the first is the identity.
 
-    They are a super-Fibonacci spiral of unit quaternions (Alexa, CVPR 2022).
+    They are a super-Fibonacci spiral of unit quaternions (Alexa, CVPR 2022); with `up`, a direction `[3]`, turns about it.
     """
+    if up is not None:
+        steps = np.arange(1, 180 / YAW_STEP_DEG + 1) * YAW_STEP_DEG
+        angles = np.concatenate([[0.0], steps, -steps[:-1]])
+        return list(Rotation.from_rotvec(np.radians(angles[np.abs(angles) <= limit_deg])[:, None] * up).as_matrix())
     s = np.arange(ROTATIONS) + 0.5
     inner, outer = np.sqrt(s / ROTATIONS), np.sqrt(1 - s / ROTATIONS)
     alpha, beta = 2 * np.pi * s / np.sqrt(2), 2 * np.pi * s / 1.533751168755204288118041
@@ -48,11 +63,18 @@ def rotations(limit_deg: float) -> list[Floats]:
     return [np.eye(3), *turns[turns.magnitude() <= np.radians(limit_deg)].as_matrix()]
 
 
+def starts(limit_deg: float, up: Floats | None = None, init: Floats | None = None) -> list[Floats]:
+    """Return poses `[4, 4]` to start from: rotations about the centres, or around `init` those by at most `NEAR_DEG`."""
+    if init is None:
+        return [matrix_of(R, np.zeros(3)) for R in rotations(limit_deg, up)]
+    return [matrix_of(R @ init[:3, :3], init[:3, 3]) for R in rotations(min(limit_deg, NEAR_DEG), up)]
+
+
 def refine(
     source: Level,
     target: Level,
     start: Floats,
-    rounds: Sequence[tuple[float, int]],
+    rounds: Rounds,
     threads: int = 1,
     kind: Literal["GICP", "ICP"] = "GICP",
     tolerance: float = 1e-3,
@@ -82,21 +104,58 @@ def refine(
     return pose, information
 
 
-def find(coarse: tuple[Level, Level], fine: tuple[Level, Level], starts: Sequence[Floats], limit_deg: float = 180.0) -> list[Candidate]:
-    """Refine poses `[4, 4]` on coarse clouds, and those that fit best on fine ones.
+def find(
+    coarse: tuple[Level, Level], fine: tuple[Level, Level], starts: Sequence[Floats], limit_deg: float = 180.0, up: Floats | None = None
+) -> list[Candidate]:
+    """Refine poses `[4, 4]` on coarse clouds, and those that fit best on fine ones; and again from where the best may have slid to.
 
     Args:
         coarse, fine: source and target.
         starts: poses to start from.
         limit_deg: poses that turn by more (and `SAME_ANGLE_DEG`) are left out; if all do, the starts are the poses.
+        up: poses that tilt this direction `[3]` by more than `MOST_TILT_DEG` are left out too.
 
     Returns:
         Poses that differ, best fit first.
     """
-    first = distinct([Candidate(found, fit(*coarse, found)) for found in (refine(*coarse, start, COARSE)[0] for start in starts)])
-    refined = [(refine(*fine, candidate.matrix, FINE)[0], candidate.starts) for candidate in first[:KEPT]]
-    within = [(found, count) for found, count in refined if _angle_deg(found) <= limit_deg + SAME_ANGLE_DEG]
-    return distinct([Candidate(found, fit(*fine, found), count) for found, count in within or [(start, 1) for start in starts]])
+
+    def from_starts(starts: Sequence[Floats], rounds: Rounds, each: int) -> list[Candidate]:
+        first = distinct(_refined(coarse, [Candidate(start, NOT_MEASURED, each) for start in starts], rounds))
+        found = _refined(fine, first[:KEPT], FINE)
+        return [c for c in found if allowed(c.matrix, limit_deg, up)]
+
+    found = distinct(from_starts(starts, COARSE, 1))
+    if not found:
+        return distinct([Candidate(start, fit(*fine, start)) for start in starts])
+    return distinct([*found, *from_starts(_slid(found[:SLID], coarse[1]), NEAR, 0)])
+
+
+def allowed(matrix: Floats, limit_deg: float, up: Floats | None) -> bool:
+    """Say whether a pose keeps to a bound on its angle, by `SAME_ANGLE_DEG` at most beyond, and tilts `up` by `MOST_TILT_DEG` at most."""
+    upright = up is None or up @ matrix[:3, :3] @ up >= np.cos(np.radians(MOST_TILT_DEG))
+    return bool(upright and turn_deg(matrix) <= limit_deg + SAME_ANGLE_DEG)
+
+
+def _refined(clouds: tuple[Level, Level], candidates: Sequence[Candidate], rounds: Rounds) -> list[Candidate]:
+    """Refine candidates, in threads."""
+
+    def refined(candidate: Candidate) -> Candidate:
+        pose = refine(*clouds, candidate.matrix, rounds)[0]
+        return Candidate(pose, fit(*clouds, pose), candidate.starts)
+
+    return in_order(refined, candidates)
+
+
+def _slid(candidates: Sequence[Candidate], target: Level) -> list[Floats]:
+    """Return the poses moved along the principal axes: two crops of a long object have their centres apart."""
+    axes = np.linalg.svd(target.points - target.points.mean(axis=0), full_matrices=False)[2]
+    moved = []
+    for candidate in candidates:
+        for step in (size * axis for axis in axes for size in SLIDES):
+            pose = candidate.matrix.copy()
+            pose[:3, 3] += step
+            moved.append(pose)
+    return moved
 
 
 def distinct(candidates: Sequence[Candidate]) -> list[Candidate]:
@@ -109,10 +168,6 @@ def distinct(candidates: Sequence[Candidate]) -> list[Candidate]:
         else:
             kept[same] = Candidate(kept[same].matrix, kept[same].fit, kept[same].starts + new.starts)
     return kept
-
-
-def _angle_deg(matrix: Floats) -> float:
-    return float(np.degrees(Rotation.from_matrix(matrix[:3, :3]).magnitude()))
 
 
 def _same(one: Floats, other: Floats) -> bool:

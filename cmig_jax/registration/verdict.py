@@ -1,63 +1,113 @@
-"""Whether a pose can be trusted: a logistic model of what speaks for it, fitted on training objects.
+"""Which of several poses is the right one, and whether it can be trusted: two logistic models of what speaks for a pose.
 
-The pairs were made of training objects: 400 to 1,024 points, crops of 50 % to 100 % each, noise of 0 to 0.02, any rotation or one up to 45
-degrees about each axis; 28 % of them of two objects, of a mirrored one, or of two sizes. `docs/choosing.md` says what it is worth.
+`calibrate` fits both on training objects and writes their weights into `verdict.json`; `docs/choosing.md` says what they are worth.
 """
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+import functools
+import json
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
 
 import numpy as np
 
-TRUSTED = 0.6
-CLOSE = 0.02
-"""Two poses fit equally well if their costs differ by less."""
-WEIGHTS = {"bias": 5.27, "cost": -2.37, "overlap": 9.6, "larger_overlap": -9.74, "margin": 0.63, "agreement": 0.78}
-LEAST_MARGIN, MOST_MARGIN = 1e-3, 0.2
+from cmig_jax.registration.evidence import evidence, turn_deg
+from cmig_jax.registration.levels import Level
+from cmig_jax.registration.search import Candidate
+from cmig_jax.registration.threads import in_order
+
+TRUSTED = 0.5
+MOST_WEIGHED = 32
+CLOSE = 0.1
+"""Two poses fit equally well if the one is at least so many times as probable as the other."""
+_FEW = 0.3
+"""What is added to the number of starts that led to a pose."""
+WEIGHTS = Path(__file__).with_suffix(".json")
 
 
-def features(costs: Sequence[float], starts: Sequence[int], overlap: tuple[float, float]) -> dict[str, float]:
-    """Return what the confidence is computed from.
+@dataclass(frozen=True)
+class Weighed:
+    """A candidate and what was found about it.
+
+    Attributes:
+        candidate: the pose.
+        numbers: of `evidence`, and `starts`, the logarithm of the share of starts that led to it, and `turn`, its angle over the bound on
+            the rotation (0 without one).
+        probability: that it is the right one, if one of the candidates is.
+    """
+
+    candidate: Candidate
+    numbers: Mapping[str, float]
+    probability: float
+
+
+def weigh(source: Level, target: Level, candidates: Sequence[Candidate], limit_deg: float = 180.0) -> list[Weighed]:
+    """Weigh candidates against each other.
 
     Args:
-        costs: of the distinct poses, best first.
-        starts: how many starts led to each.
-        overlap: of the best pose.
+        source, target: the clouds.
+        candidates: best fit first; the first `MOST_WEIGHED` are weighed.
+        limit_deg: bound on the rotation.
 
     Returns:
-        `cost` of the best pose; `overlap`, the smaller share, and `larger_overlap`; `margin`, the logarithm of what the next pose costs
-        more; `agreement`, the logarithm of the share of starts that led to the best pose.
+        The most probable first.
     """
-    margin = costs[1] - costs[0] if len(costs) > 1 else MOST_MARGIN
-    return {
-        "bias": 1.0,
-        "cost": costs[0],
-        "overlap": min(overlap),
-        "larger_overlap": max(overlap),
-        "margin": float(np.log(np.clip(margin, LEAST_MARGIN, MOST_MARGIN))),
-        "agreement": float(np.log(starts[0] / sum(starts))),
-    }
+    numbers = numbers_of(source, target, candidates, limit_deg)
+    scores = np.array([weighted_sum(weights()["choice"], found) for found in numbers])
+    shares = np.exp(scores - scores.max())
+    shares /= shares.sum()
+    weighed = [Weighed(*each) for each in zip(candidates, numbers, shares.tolist(), strict=False)]
+    return sorted(weighed, key=lambda each: -each.probability)
 
 
-def confidence(found: dict[str, float]) -> float:
-    """Return the estimated probability that the pose is right."""
-    return float(1 / (1 + np.exp(-sum(WEIGHTS[name] * value for name, value in found.items()))))
+def numbers_of(source: Level, target: Level, candidates: Sequence[Candidate], limit_deg: float) -> list[dict[str, float]]:
+    """Return the numbers of `Weighed` for the first `MOST_WEIGHED` candidates."""
+    starts = sum(candidate.starts for candidate in candidates)
+
+    def numbers(candidate: Candidate) -> dict[str, float]:
+        return {
+            **evidence(source, target, candidate.matrix),
+            "starts": float(np.log((candidate.starts + _FEW) / (starts + _FEW))),
+            "turn": turn_deg(candidate.matrix) / limit_deg if limit_deg < 180 else 0.0,
+        }
+
+    return in_order(numbers, candidates[:MOST_WEIGHED])
 
 
-def explain(found: dict[str, float], ratio: float) -> str:
+def confidence(best: Weighed) -> float:
+    """Return the estimated probability that the best pose is right, the possibility that none of the candidates is included."""
+    found = {**best.numbers, "probability": float(np.log(best.probability)), "one": 1.0}
+    return float(1 / (1 + np.exp(-weighted_sum(weights()["confidence"], found))))
+
+
+def explain(confident: float, best: Weighed, ratio: float) -> str:
     """Say in one sentence what decided.
 
     Args:
-        found: the features.
+        confident: the confidence.
+        best: the best pose.
         ratio: radius of the larger cloud over that of the smaller.
     """
-    if confidence(found) >= TRUSTED:
+    if confident >= TRUSTED:
         return "aligned"
-    if ratio > 1.2 and found["larger_overlap"] < 0.8:
+    overlap = best.candidate.fit.overlap
+    if ratio > 1.2 and max(overlap) < 0.8:
         return f"the clouds do not fit; their sizes differ: {ratio:.3g} : 1"
-    if found["overlap"] < 0.3:
+    if min(overlap) < 0.3:
         return "the clouds share too little"
-    if found["margin"] < np.log(CLOSE):
+    if best.probability < 1 / (1 + CLOSE):
         return "two poses fit equally well: a symmetric object?"
     return "no pose that was tried fits well"
+
+
+def weighted_sum(given: Mapping[str, float], found: Mapping[str, float]) -> float:
+    """Return the sum of numbers times their weights."""
+    return sum(weight * found[name] for name, weight in given.items())
+
+
+@functools.cache
+def weights() -> dict[str, dict[str, float]]:
+    """Read the weights of the `choice` and of the `confidence`."""
+    return json.loads(WEIGHTS.read_text(encoding="utf-8"))

@@ -127,6 +127,15 @@ def test_results_go_nowhere_else(main, trained, out):
     assert_one_line(main("evaluate", trained[0], "--out", out), f"out = {out!r}: expected the name of a")
 
 
+def test_register_stands_beside_the_network_if_asked_for(main, trained, tmp_path):
+    done = main("evaluate", trained[0], "--limit", 1, "--search", "any", "bound", "--out", "searched")
+    assert done.returncode == 0, done.stderr
+    results = json.loads((trained[0] / "searched" / "results.json").read_text())
+    assert results["config"]["register"] == {"register": "any", "register (within 85.8 deg)": 85.8}
+    assert np.isfinite([results[row]["rmse_r_deg"] for row in results["config"]["register"]]).all()
+    shutil.rmtree(trained[0] / "searched")
+
+
 def test_batches_of_no_pair_are_one_line_of_error(main, trained):
     assert_one_line(main("evaluate", trained[0], "--batch", 0), "batch = 0: expected at least 1 pair")
 

@@ -7,7 +7,16 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from cmig_jax.config import DataConfig
-from cmig_jax.data.protocol import crop, keep_farthest_along, keep_nearest, make_clouds, mean_angle_deg, random_pose, samplings
+from cmig_jax.data.protocol import (
+    crop,
+    keep_farthest_along,
+    keep_nearest,
+    largest_rotation_deg,
+    make_clouds,
+    mean_angle_deg,
+    random_pose,
+    samplings,
+)
 
 CLEAN = DataConfig(points=100, noise_std=0.0, crop="none")
 OBJECT = np.random.default_rng(3).normal(size=(300, 3))
@@ -54,12 +63,23 @@ def test_rotations_are_Rx_Ry_Rz_with_every_angle_in_range(turn, lowest, mean):
     assert lowest <= angles.min() < angles.max() <= 45
     np.testing.assert_allclose(angles.mean(0), mean, atol=4)
     assert mean_angle_deg(DataConfig(turn=turn)) == mean
+    largest = np.degrees([Rotation.from_matrix(R).magnitude() for R, _ in poses]).max()
+    assert largest <= largest_rotation_deg(DataConfig(turn=turn)) < largest + 12
+
     assert mean_angle_deg(DataConfig(source="stanford-scans")) == 0
     assert -0.5 <= shifts.min() < -0.49
     assert 0.49 < shifts.max() <= 0.5
     np.testing.assert_allclose(shifts.mean(0), 0, atol=0.05)
     drawn = [Rotation.from_matrix(draw(replace(CLEAN, turn=turn), seed)["R"]).as_euler("XYZ").min() for seed in range(20)]
     assert (min(drawn) < 0) == (turn == "either")
+
+
+def test_any_rotation_is_uniform_over_the_sphere():
+    rng = np.random.default_rng(0)
+    turned = np.stack([random_pose(rng, 45.0, 0.5, "any")[0] for _ in range(2_000)])
+    np.testing.assert_allclose(turned.mean(axis=0), 0, atol=0.05)
+    np.testing.assert_allclose(np.mean(turned**2, axis=0), 1 / 3, atol=0.03)
+    assert (mean_angle_deg(DataConfig(turn="any")), largest_rotation_deg(DataConfig(turn="any"))) == (0, 180)
 
 
 @pytest.mark.parametrize("seed", range(3))

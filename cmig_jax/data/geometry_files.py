@@ -170,7 +170,7 @@ def _checked(path: Path, parsed: Parsed, invalid: Literal["error", "drop"]) -> G
     try:
         cloud = check_cloud(points[finite] if dropped else points, path)
     except ValueError as error:
-        hint = "" if finite.all() else '; invalid="drop" (--drop-invalid) leaves them out'
+        hint = "" if finite.all() else '; invalid="drop" (cmig register --drop-invalid) leaves them out'
         raise ValueError(f"{error}{hint}") from error
     return GeometryFile(path, cloud, None, dropped, parsed.content, parsed.unit)
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import io
+import zipfile
 from dataclasses import dataclass
 
 import numpy as np
@@ -64,13 +65,29 @@ def _exported(scene: trimesh.Scene, suffix: str) -> bytes:
     written = scene.to_mesh().export(file_type="stl") if suffix == ".stl" else scene.export(file_type=suffix[1:])
     if not isinstance(written, bytes):
         raise TypeError(f"trimesh wrote {type(written)} for {suffix}; expected bytes")
-    return written
+    unit = (scene.units or "millimeter").removesuffix("s")  # trimesh names GLB's unit meters
+    return _with_unit(written, unit) if suffix == ".3mf" and unit != "millimeter" else written
+
+
+def _with_unit(content: bytes, unit: str) -> bytes:
+    """Return a 3MF file with another unit than the one that trimesh always writes."""
+    changed = io.BytesIO()
+    with zipfile.ZipFile(io.BytesIO(content)) as old, zipfile.ZipFile(changed, "w", zipfile.ZIP_DEFLATED) as new:
+        for name in old.namelist():
+            member = old.read(name)
+            new.writestr(name, member.replace(b'unit="millimeter"', f'unit="{unit}"'.encode(), 1) if name.endswith(".model") else member)
+    return changed.getvalue()
 
 
 def _check_stl(content: bytes) -> None:
-    """Raise ValueError for text that ends early; trimesh checks the length of binary files."""
-    if content.lstrip()[:5].lower() == b"solid" and b"facet" in content[:4096] and b"endsolid" not in content[-4096:]:
-        raise ValueError("no line endsolid; expected one at the end")
+    """Raise ValueError for a file that ends early."""
+    if content.lstrip()[:5].lower() == b"solid" and (b"facet" in content[:4096] or b"endsolid" in content):
+        if b"endsolid" not in content[-4096:]:
+            raise ValueError("no line endsolid; expected one at the end")
+        return
+    count = int.from_bytes(content[80:84], "little")
+    if len(content) < 84 + 50 * count:
+        raise ValueError(f"{max(0, len(content) - 84)} bytes of triangles; expected {50 * count} for {count}")
 
 
 def _check_3mf_libraries() -> None:

@@ -6,6 +6,8 @@ import numpy as np
 import pytest
 import trimesh
 
+from cmig_jax.data.formats.scenes import _with_unit
+
 BOX = trimesh.creation.box((1, 2, 3))
 
 
@@ -49,6 +51,15 @@ def test_the_unit_of_3mf_is_said(read):
     assert read("a.stl", BOX.export(file_type="stl")).unit is None
 
 
+def test_the_unit_of_3mf_stays(read, move, matrix):
+    """The library that writes it knows millimetres only."""
+    source = read("a.3mf", _with_unit(BOX.export(file_type="3mf"), "inch"))
+    _, found = move(source, "b.3mf", matrix)
+    assert (source.unit, found.unit) == ("inch", "inch")
+    np.testing.assert_allclose(found.mesh.bounds, BOX.copy().apply_transform(matrix).bounds, atol=1e-5)
+    assert move(read("a.glb", BOX.export(file_type="glb")), "c.3mf", matrix)[1].unit == "meter"
+
+
 def test_stl_as_text(read):
     text = BOX.export(file_type="stl_ascii")
     assert read("a.stl", text).mesh.area == pytest.approx(22)
@@ -69,8 +80,15 @@ def test_damage_is_named(read, suffix):
     for damaged in (content[:-50], content[:90], content[:10], b"ply\n" * 50):
         with pytest.raises(ValueError, match=f"not a readable {suffix.upper()} file"):
             read(f"a.{suffix}", damaged)
-    with pytest.raises(ValueError, match=r"a\.stl: .*no triangles"):
-        read("a.stl", b"\0" * 84)
+    for empty in (b"\0" * 84, b"solid x\nendsolid x\n"):
+        with pytest.raises(ValueError, match=r"a\.stl: .*no triangles"):
+            read("a.stl", empty)
+
+
+def test_an_stl_of_fewer_triangles_than_declared_is_refused(read):
+    content = BOX.export(file_type="stl")
+    with pytest.raises(ValueError, match="600 bytes of triangles; expected 107374182400 for 2147483648"):
+        read("a.stl", content[:80] + (2**31).to_bytes(4, "little") + content[84:])
 
 
 @pytest.mark.parametrize("library", ["lxml", "networkx"])

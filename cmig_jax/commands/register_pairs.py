@@ -17,7 +17,7 @@ import numpy as np
 from tqdm import tqdm
 
 from cmig_jax.commands import Stopped
-from cmig_jax.commands.register_inputs import Options, points_of
+from cmig_jax.commands.register_inputs import Options, points_of, warn_of_units
 
 MATRIX = tuple(f"m{row}{column}" for row in range(4) for column in range(4))
 MEASURED = ("trusted", "why", "confidence", "overlap_source", "overlap_target", "inlier_rmse", "seconds", *MATRIX)
@@ -108,7 +108,9 @@ def _register(pair: ListedPair, options: Options) -> Row:
     begin = time.perf_counter()
     try:
         rotations = _rotations(pair.rotations) if pair.rotations else options.rotations
-        source, target = (points_of(read_geometry(path, options.invalid).geometry, seed) for seed, path in enumerate(pair.files))
+        files = [read_geometry(path, options.invalid) for path in pair.files]
+        warn_of_units(*files)
+        source, target = (points_of(file.geometry, seed) for seed, file in enumerate(files))
         found = register(source, target, options.network, rotations=rotations, up=options.up, refine=options.refine)
     except (ValueError, OSError) as error:
         return _row(pair, error=" ".join(str(error).split()))

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from cmig_jax.commands.register_inputs import Options, points_of
+from cmig_jax.commands.register_inputs import Options, points_of, warn_of_units
 
 if TYPE_CHECKING:
     from cmig_jax.data.geometry_files import GeometryFile
@@ -30,6 +30,8 @@ def run_sequence(paths: Sequence[Path], out: Path, options: Options, quiet: bool
 
     out.mkdir(parents=True, exist_ok=True)
     files = [read_geometry(path, options.invalid) for path in paths]
+    for file in files[1:]:
+        warn_of_units(files[0], file)
     clouds = [points_of(file.geometry, seed) for seed, file in enumerate(files)]
     names = [str(path) for path in paths]
     found = register_sequence(clouds, options.network, rotations=options.rotations, up=options.up, names=names, progress=not quiet)

@@ -20,6 +20,8 @@ from cmig_jax.registration.threads import in_order
 
 TRUSTED = 0.5
 MOST_WEIGHED = 32
+ANY_OVERLAP = 5
+"""A cloud that is so many times smaller lies within the other one at any pose."""
 CLOSE = 0.1
 """Two poses fit equally well if the one is at least so many times as probable as the other."""
 _FEW = 0.3
@@ -70,7 +72,7 @@ def numbers_of(source: Level, target: Level, candidates: Sequence[Candidate], li
         return {
             **evidence(source, target, candidate.matrix),
             "starts": float(np.log((candidate.starts + _FEW) / (starts + _FEW))),
-            "turn": turn_deg(candidate.matrix) / limit_deg if limit_deg < 180 else 0.0,
+            "turn": turn_deg(candidate.matrix) / max(limit_deg, 1.0) if limit_deg < 180 else 0.0,
         }
 
     return in_order(numbers, candidates[:MOST_WEIGHED])
@@ -93,7 +95,7 @@ def explain(confident: float, best: Weighed, ratio: float) -> str:
     if confident >= TRUSTED:
         return "aligned"
     overlap = best.candidate.fit.overlap
-    if ratio > 1.2 and max(overlap) < 0.8:
+    if ratio > 1.2 and (max(overlap) < 0.8 or ratio > ANY_OVERLAP):
         return f"the clouds do not fit; their sizes differ: {ratio:.3g} : 1"
     if min(overlap) < 0.3:
         return "the clouds share too little"

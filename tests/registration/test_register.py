@@ -161,6 +161,17 @@ def test_a_start_and_a_bound_on_the_rotation_are_kept_to():
             register(SOURCE, TARGET, rotations=wrong)  # pyright: ignore[reportArgumentType]
 
 
+def test_a_bound_of_0_leaves_the_translation():
+    found = register(SOURCE, surface(600, 1) + T, rotations=0)
+    assert is_right(found, np.eye(3))
+    assert found.trusted
+
+
+def test_the_reason_for_a_cloud_of_another_unit_is_the_sizes():
+    for unit in (0.001, 1_000):
+        assert "their sizes differ" in register(unit * SOURCE, TARGET).why
+
+
 def test_rotations_are_spread_evenly():
     """Every rotation has one within 32 degrees among those that are tried."""
     tried, asked = Rotation.from_matrix(np.array(rotations(180))), Rotation.from_quat(np.random.default_rng(0).normal(size=(300, 4)))

@@ -87,6 +87,7 @@ def test_twenty_large_pairs_stay_below_ten_megabytes(tmp_path, make_errors, make
         ({"noise_std": 0.0, "crop": "none", "sampling": "twice"}, ["sampled twice, no crop, no noise"]),
         ({"exclude": ("cone", "vase"), "max_angle_deg": 60.0}, ["all categories without cone, vase", "up to 60° per axis,"]),
         ({"turn": "either"}, ["up to 45° per axis to either side,"]),
+        ({"turn": "any"}, ["; any rotation, translations up to 0.5"]),
         ({"source": "stanford-scans"}, ["stanford-scans, 12 recorded pairs turned by up to 45°, 768 points per cloud"]),
     ],
 )

@@ -28,8 +28,9 @@ MOST_SHARED = 10_000
 """Larger clouds are not expected to share their points."""
 WORSE = 0.02
 """The last refinement is dropped if the cost grows by more."""
-LAST_CUTOFF, SPACINGS, LAST_ITERATIONS = 0.05, 3.0, 30
-"""Cutoff of the last refinement: so many spacings of the clouds, at most `LAST_CUTOFF`."""
+LAST_CUTOFF, SPACINGS, LEAST_SPACINGS, LAST_ITERATIONS = 0.05, 3.0, 2.0, 30
+"""Cutoff of the last refinement: `SPACINGS` of the clouds or `LAST_CUTOFF` if that is less, but at least `LEAST_SPACINGS`, within which
+nearly every point of two samplings has a partner."""
 
 
 def register(
@@ -151,13 +152,12 @@ def _refined(dense: tuple[Level, Level], fine: tuple[Level, Level], candidate: s
     Clouds that share most of their points fit better by point-to-point ICP: most partners are then at less than half the distance.
     """
     spacing = max(level.spacing for level in dense)
-    rounds = [(min(LAST_CUTOFF, SPACINGS * spacing), LAST_ITERATIONS)]
-    threads = 1  # several add up in another order each time; on 100,000 points they would save 0.1 s
-    refined, information = search.refine(*dense, candidate.matrix, rounds, threads)
+    rounds = [(max(min(LAST_CUTOFF, SPACINGS * spacing), LEAST_SPACINGS * spacing), LAST_ITERATIONS)]
+    refined, information = search.refine(*dense, candidate.matrix, rounds)
     measured = fit(*fine, refined)
     if max(len(level.points) for level in dense) <= MOST_SHARED:
         closer = [*rounds, (spacing / 4, LAST_ITERATIONS)]  # where points without a twin have no partner
-        by_points, _ = search.refine(*dense, refined, closer, threads, "ICP", tolerance=1e-7)
+        by_points, _ = search.refine(*dense, refined, closer, "ICP", tolerance=1e-7)
         if fit(*fine, by_points).median < measured.median / 2:
             return by_points, information
     return (candidate.matrix if measured.cost > candidate.fit.cost + WORSE else refined), information

@@ -18,7 +18,6 @@ from cmig_jax.registration.evidence import turn_deg
 from cmig_jax.registration.fit import Fit, fit
 from cmig_jax.registration.frame import matrix_of
 from cmig_jax.registration.levels import Level
-from cmig_jax.registration.threads import in_order
 
 Floats = NDArray[np.float64]
 Rounds = Sequence[tuple[float, int]]
@@ -136,13 +135,8 @@ def allowed(matrix: Floats, limit_deg: float, up: Floats | None) -> bool:
 
 
 def _refined(clouds: tuple[Level, Level], candidates: Sequence[Candidate], rounds: Rounds) -> list[Candidate]:
-    """Refine candidates, in threads."""
-
-    def refined(candidate: Candidate) -> Candidate:
-        pose = refine(*clouds, candidate.matrix, rounds)[0]
-        return Candidate(pose, fit(*clouds, pose), candidate.starts)
-
-    return in_order(refined, candidates)
+    poses = [refine(*clouds, candidate.matrix, rounds)[0] for candidate in candidates]
+    return [Candidate(pose, fit(*clouds, pose), candidate.starts) for pose, candidate in zip(poses, candidates, strict=True)]
 
 
 def _slid(candidates: Sequence[Candidate], target: Level) -> list[Floats]:
@@ -159,16 +153,17 @@ def _slid(candidates: Sequence[Candidate], target: Level) -> list[Floats]:
 
 def distinct(candidates: Sequence[Candidate]) -> list[Candidate]:
     """Sort by fit, and join poses that are within `SAME_ANGLE_DEG` and `SAME_SHIFT` of a better one."""
-    kept: list[Candidate] = []
-    for new in sorted(candidates, key=lambda candidate: candidate.fit.cost):
-        same = next((i for i, old in enumerate(kept) if _same(old.matrix, new.matrix)), None)
-        if same is None:
-            kept.append(new)
+    ordered = sorted(candidates, key=lambda candidate: candidate.fit.cost)
+    R = np.array([candidate.matrix[:3, :3].ravel() for candidate in ordered])
+    t = np.array([candidate.matrix[:3, 3] for candidate in ordered])
+    least_trace = 1 + 2 * np.cos(np.radians(SAME_ANGLE_DEG))
+    kept: dict[int, Candidate] = {}
+    for i, new in enumerate(ordered):
+        better = list(kept)
+        same = (R[better] @ R[i] >= least_trace) & (np.linalg.norm(t[better] - t[i], axis=1) < SAME_SHIFT)
+        if same.any():
+            first = better[int(np.argmax(same))]
+            kept[first] = Candidate(kept[first].matrix, kept[first].fit, kept[first].starts + new.starts)
         else:
-            kept[same] = Candidate(kept[same].matrix, kept[same].fit, kept[same].starts + new.starts)
-    return kept
-
-
-def _same(one: Floats, other: Floats) -> bool:
-    turned = np.trace(one[:3, :3].T @ other[:3, :3]) < 1 + 2 * np.cos(np.radians(SAME_ANGLE_DEG))
-    return not turned and bool(np.linalg.norm(one[:3, 3] - other[:3, 3]) < SAME_SHIFT)
+            kept[i] = new
+    return list(kept.values())

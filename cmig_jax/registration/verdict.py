@@ -16,7 +16,6 @@ import numpy as np
 from cmig_jax.registration.evidence import evidence, turn_deg
 from cmig_jax.registration.levels import Level
 from cmig_jax.registration.search import Candidate
-from cmig_jax.registration.threads import in_order
 
 TRUSTED = 0.5
 MOST_WEIGHED = 32
@@ -75,7 +74,7 @@ def numbers_of(source: Level, target: Level, candidates: Sequence[Candidate], li
             "turn": turn_deg(candidate.matrix) / max(limit_deg, 1.0) if limit_deg < 180 else 0.0,
         }
 
-    return in_order(numbers, candidates[:MOST_WEIGHED])
+    return [numbers(candidate) for candidate in candidates[:MOST_WEIGHED]]
 
 
 def confidence(best: Weighed) -> float:

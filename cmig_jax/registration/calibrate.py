@@ -24,6 +24,7 @@ from cmig_jax.files import write_text
 from cmig_jax.registration import search, verdict
 from cmig_jax.registration.clouds import user_cloud
 from cmig_jax.registration.drawn import Drawn, draw
+from cmig_jax.registration.evidence import DISTANCES
 from cmig_jax.registration.frame import Frame
 from cmig_jax.registration.register import LEVELS
 from cmig_jax.transform import RigidTransform
@@ -33,7 +34,7 @@ Job = tuple[list[RawObject], int, int]
 """Objects, seed and number of a pair."""
 MOST_ANGLE_DEG, MOST_SHIFT = 5.0, 0.05
 """A pose is right within these."""
-CHOICE = ("cost", "cut", *(f"distance_{low:g}" for low in (0, 0.5, 1.5, 2, 3)), "starts", "turn")
+CHOICE = ("cost", "cut", *(f"distance_{low:g}" for low, _ in DISTANCES), "starts", "turn")
 RIDGE = 0.003
 BINS = 10
 

@@ -83,7 +83,7 @@ def register(
         bound = (limit, vertical) if init is None else (180.0, None)
         candidates = search.find(coarse, fine, starts, *bound)
         clock.stage("search")
-        chosen, *others = verdict.weigh(*fine, candidates, limit)
+        chosen, *others = verdict.weigh(*fine, candidates, bound[0])
         clock.stage("choice")
         best, information = _refined(dense, fine, chosen.candidate)
         best = best if search.allowed(best, *bound) else chosen.candidate.matrix

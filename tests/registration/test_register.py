@@ -167,6 +167,13 @@ def test_a_bound_of_0_leaves_the_translation():
     assert found.trusted
 
 
+def test_a_bound_beside_a_start_does_not_lower_the_confidence():
+    near = RigidTransform(Rotation.from_euler("x", 5, degrees=True).as_matrix() @ R, T)
+    free, bounded = register(SOURCE, TARGET, init=near), register(SOURCE, TARGET, init=near, rotations=25)
+    assert is_right(bounded)
+    assert bounded.confidence == free.confidence
+
+
 def test_the_reason_for_a_cloud_of_another_unit_is_the_sizes():
     for unit in (0.001, 1_000):
         assert "their sizes differ" in register(unit * SOURCE, TARGET).why

@@ -161,6 +161,7 @@ class Needs:
         pairs: fewest pairs per training step.
         views: whether it reads depth views.
         equal_sizes: whether both clouds must have the same number of points.
+        normals: whether it reads unit normals of the points.
     """
 
     points: int = 3
@@ -168,6 +169,7 @@ class Needs:
     pairs: int = 1
     views: bool = False
     equal_sizes: bool = False
+    normals: bool = False
 
 
 @dataclass(frozen=True)

@@ -23,12 +23,16 @@ class Batch:
         views: `[B, S, V, H, W, 1]` uint8 depth, 0 = background; `[B, S, V, H, W, 3]` float, normalised RGB; or `[B, S, V, C]`, the
             features of the views, computed elsewhere. S = 1: one set for both clouds; S = 2: source, target. None without images.
         target_from_source: `[B]` the true poses; needed for training, None for inference.
+        source_normals: `[B, N, 3]` unit normals of the source's points, or None without normals.
+        target_normals: `[B, M, 3]` of the target's.
     """
 
     source: Array
     target: Array
     views: Array | None = None
     target_from_source: RigidTransform | None = None
+    source_normals: Array | None = None
+    target_normals: Array | None = None
 
 
 @struct.dataclass
@@ -55,7 +59,11 @@ class Prediction:
     Attributes:
         target_from_source: `[B]` the estimated poses.
         correspondences: of the last iteration, or None for a network that matches no points.
+        source_overlap: `[B, N]` score in [0, 1] of each source point having a correspondent in the target, or None.
+        target_overlap: `[B, M]` of the target's points.
     """
 
     target_from_source: RigidTransform
     correspondences: Correspondences | None = None
+    source_overlap: Array | None = None
+    target_overlap: Array | None = None

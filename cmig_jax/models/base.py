@@ -60,4 +60,6 @@ def smallest_batch(needs: Needs) -> Batch:
         target=jnp.zeros((1, points, 3)),
         views=jnp.zeros((1, 1, 1, 32, 32, 1), jnp.uint8) if needs.views else None,
         target_from_source=RigidTransform.identity((1,)),
+        source_normals=jnp.zeros((1, points, 3)) if needs.normals else None,
+        target_normals=jnp.zeros((1, points, 3)) if needs.normals else None,
     )

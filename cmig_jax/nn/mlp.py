@@ -3,13 +3,14 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from typing import Literal
 
 import flax.linen as nn
 import jax
 from jax import Array
 
 from cmig_jax.config import ComputeConfig
-from cmig_jax.nn.norm import BatchNorm
+from cmig_jax.nn.norm import BatchNorm, GroupNorm
 from cmig_jax.ops.moments import channels
 
 # PyTorch's default for linear and convolution layers: uniform within 1 / sqrt(fan in).
@@ -59,17 +60,35 @@ class Weights(nn.Module):
 
 
 class NormedMLP(nn.Module):
-    """Layers of linear (no bias), BatchNorm, ReLU, one per width."""
+    """Layers of linear, normalisation and (leaky) ReLU, one per width.
+
+    Attributes:
+        widths: channels of the layers.
+        use_bias: of the linear layers.
+        norm: over the batch and all positions (running statistics in evaluation), over groups of channels and all positions of one
+            sample, or none.
+        groups: of `norm="group"`, one number for all layers or one for each.
+        negative_slope: of the activation; 0 is ReLU.
+    """
 
     widths: tuple[int, ...]
     compute: ComputeConfig = ComputeConfig()
+    use_bias: bool = False
+    norm: Literal["batch", "group", "none"] = "batch"
+    groups: int | tuple[int, ...] = 8
+    negative_slope: float = 0.0
 
     @nn.compact
     def __call__(self, x: Array, *, train: bool) -> Array:
-        """Map `x [..., C]` to `[..., widths[-1]]`."""
+        """Map `x [..., C]` (`[B, ..., C]` for groups) to `[..., widths[-1]]`."""
         for i, width in enumerate(self.widths):
-            x = Dense(width, use_bias=False, compute=self.compute, name=f"layer_{i}")(x)
-            x = nn.relu(BatchNorm(width, compute=self.compute, name=f"norm_{i}")(x, train=train))
+            x = Dense(width, use_bias=self.use_bias, compute=self.compute, name=f"layer_{i}")(x)
+            if self.norm == "batch":
+                x = BatchNorm(width, compute=self.compute, name=f"norm_{i}")(x, train=train)
+            elif self.norm == "group":
+                groups = self.groups if isinstance(self.groups, int) else self.groups[i]
+                x = GroupNorm(groups, name=f"norm_{i}")(x)
+            x = nn.leaky_relu(x, self.negative_slope) if self.negative_slope else nn.relu(x)
         return x
 
 

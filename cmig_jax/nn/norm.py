@@ -46,6 +46,23 @@ class BatchNorm(nn.Module):
         return Affine(mean=mean, scale=self.scale * jax.lax.rsqrt(variance + EPSILON), bias=self.bias, kernels=self.compute.kernels)
 
 
+class GroupNorm(nn.Module):
+    """Normalisation of each sample over groups of consecutive channels and all positions (Wu and He, ECCV 2018)."""
+
+    groups: int
+
+    @nn.compact
+    def __call__(self, x: Array) -> Array:
+        """Normalise `x [B, ..., C]`."""
+        scale = self.param("scale", nn.initializers.ones, (x.shape[-1],))
+        bias = self.param("bias", nn.initializers.zeros, (x.shape[-1],))
+        wide = x.astype(jnp.promote_types(x.dtype, jnp.float32)).reshape(x.shape[0], -1, self.groups, x.shape[-1] // self.groups)
+        centred = wide - jnp.mean(wide, axis=(1, 3), keepdims=True)
+        variance = jnp.mean(centred**2, axis=(1, 3), keepdims=True)
+        normed = (centred * jax.lax.rsqrt(variance + EPSILON)).reshape(x.shape)
+        return (normed * channels(scale, x.ndim) + channels(bias, x.ndim)).astype(x.dtype)
+
+
 class LayerNorm(nn.Module):
     """Layer normalisation with the unbiased standard deviation and epsilon outside the root, as in the reference's transformer."""
 

@@ -10,7 +10,8 @@ from typing import Any
 from cmig_jax.models.cmignet.flags import CMIGNetFlags, ImageFlags, MatchingFlags, PointsFlags, released
 from cmig_jax.models.cmignet.heads import CREDIBILITY_WIDTH
 from cmig_jax.parity.cases import State
-from cmig_jax.parity.weights import COUNTER, RUNNING, Tensor, named_weights, to_flax
+from cmig_jax.parity.layers import linear, normalisation, stack, transformer
+from cmig_jax.parity.weights import Tensor, named_weights, to_flax
 
 UNUSED = ("significance_fc.", "MVCNN.fc.", "head.")
 IMAGE_CLASSES = 40
@@ -18,7 +19,14 @@ IMAGE_CLASSES = 40
 
 def layout(flags: CMIGNetFlags) -> list[Tensor]:
     """List the tensors of a network of the released kind, in the order of its `state_dict`."""
-    return [*_points(flags), *_significance(flags), *_heads(flags), *_images(flags), *_transformer(flags), *_score(flags)]
+    return [
+        *_points(flags),
+        *_significance(flags),
+        *_heads(flags),
+        *_images(flags),
+        *transformer("attn.model", "transformer", flags.points.dim, flags.fusion.feed_forward),
+        *_score(flags),
+    ]
 
 
 def named_variables(flags: CMIGNetFlags, seed: int) -> dict[str, Any]:
@@ -74,44 +82,21 @@ def flags_of_state(state: State) -> CMIGNetFlags:
     )
 
 
-def _layer(name: str, shape: tuple[int, ...], path: str | None, bias: bool = True, spatial: bool = False) -> Iterator[Tensor]:
-    """List a convolution or a linear layer, `shape [out, in, ...]`."""
-    own = path and ("params", *path.split("/"))
-    yield Tensor(f"{name}.weight", shape, (*own, "kernel") if own else None, spatial)
-    if bias:
-        yield Tensor(f"{name}.bias", shape[:1], (*own, "bias") if own else None)
-
-
-def _norm(name: str, channels: int, path: str | None) -> Iterator[Tensor]:
-    leaves = (("weight", "params", "scale"), ("bias", "params", "bias"))
-    for leaf, kind, other in (*leaves, (RUNNING[0], "batch_stats", "mean"), (RUNNING[1], "batch_stats", "var")):
-        yield Tensor(f"{name}.{leaf}", (channels,), (kind, *path.split("/"), other) if path else None)
-    yield Tensor(f"{name}.{COUNTER}", ())
-
-
 def _points(flags: CMIGNetFlags) -> Iterator[Tensor]:
     *edges, (last, linked) = zip(
         (*flags.points.widths, flags.points.dim), itertools.accumulate(flags.points.widths, initial=3), strict=True
     )
     for i, (width, inputs) in enumerate(edges):
-        yield from _layer(f"emb_nn.conv{i + 1}", (width, 2 * inputs, 1, 1), f"points/edge_{i}", bias=False)
-    yield from _layer(f"emb_nn.conv{len(edges) + 1}", (last, linked, 1, 1), "points/last", bias=False)
+        yield from linear(f"emb_nn.conv{i + 1}", (width, 2 * inputs, 1, 1), f"points/edge_{i}", bias=False)
+    yield from linear(f"emb_nn.conv{len(edges) + 1}", (last, linked, 1, 1), "points/last", bias=False)
     for i, (width, _) in enumerate(edges):
-        yield from _norm(f"emb_nn.bn{i + 1}", width, f"points/edge_{i}/norm")
-    yield from _norm(f"emb_nn.bn{len(edges) + 1}", last, "points/last_norm")
-
-
-def _stack(name: str, sizes: tuple[int, ...], unit: tuple[int, ...], paths: list[tuple[str | None, str | None]]) -> Iterator[Tensor]:
-    """List 1x1 convolutions `sizes[0] -> sizes[1] -> ...` without bias, each with its BatchNorm, and a last one with bias alone."""
-    for i, ((inputs, width), (layer, norm)) in enumerate(zip(itertools.pairwise(sizes[:-1]), paths, strict=False)):
-        yield from _layer(f"{name}.conv.{i}.conv", (width, inputs, *unit), layer, bias=False)
-        yield from _norm(f"{name}.conv.{i}.bn", width, norm)
-    yield from _layer(f"{name}.conv.{len(sizes) - 2}", (sizes[-1], sizes[-2], *unit), paths[-1][0])
+        yield from normalisation(f"emb_nn.bn{i + 1}", width, f"points/edge_{i}/norm")
+    yield from normalisation(f"emb_nn.bn{len(edges) + 1}", last, "points/last_norm")
 
 
 def _significance(flags: CMIGNetFlags) -> Iterator[Tensor]:
     """List what the released network has and never uses, and the constant of its pose solver."""
-    yield from _stack("significance_fc", (*(flags.points.dim // 2**i for i in range(5)), 1), (1,), [(None, None)] * 5)
+    yield from stack("significance_fc", (*(flags.points.dim // 2**i for i in range(5)), 1), (1,), [(None, None)] * 5)
     yield Tensor("head.reflect", (3, 3))
 
 
@@ -123,18 +108,18 @@ def _heads(flags: CMIGNetFlags) -> Iterator[Tensor]:
             tower = f"heads_{i}/{part}_tower"
             hidden = [(f"{tower}/hidden/layer_{j}", f"{tower}/hidden/norm_{j}") for j in range(len(widths) - 1)]
             paths = [(f"heads_{i}/{part}_pairs", f"{tower}/first_norm"), *hidden, (f"{tower}/last", None)]
-            yield from _stack(f"{name}.{i}", (inputs, *widths, 1), (1, 1), paths)
+            yield from stack(f"{name}.{i}", (inputs, *widths, 1), (1, 1), paths)
     for i in heads:
         own = f"heads_{i}/credibility"
-        yield from _stack(f"weight_fc.{i}", (C, C, 1), (1,), [(f"{own}/hidden/layer_0", f"{own}/hidden/norm_0"), (f"{own}/last", None)])
+        yield from stack(f"weight_fc.{i}", (C, C, 1), (1,), [(f"{own}/hidden/layer_0", f"{own}/hidden/norm_0"), (f"{own}/last", None)])
     for i in heads:
-        yield from _layer(f"preweight.{i}.conv.0", (C, 2, 1, 1), f"heads_{i}/pre")
+        yield from linear(f"preweight.{i}.conv.0", (C, 2, 1, 1), f"heads_{i}/pre")
 
 
 def _images(flags: CMIGNetFlags) -> Iterator[Tensor]:
     def convolution(layer: str, norm: str, shape: tuple[int, int], size: int, path: str, norm_path: str) -> Iterator[Tensor]:
-        yield from _layer(layer, (*shape, size, size), path, bias=False, spatial=True)
-        yield from _norm(norm, shape[0], norm_path)
+        yield from linear(layer, (*shape, size, size), path, bias=False, spatial=True)
+        yield from normalisation(norm, shape[0], norm_path)
 
     inputs, *_ = widths = flags.image.widths
     yield from convolution("MVCNN.net.0", "MVCNN.net.1", (inputs, 3), 7, "views/stem", "views/stem_norm")
@@ -147,24 +132,10 @@ def _images(flags: CMIGNetFlags) -> Iterator[Tensor]:
                 names, paths = (f"{name}.downsample.0", f"{name}.downsample.1"), (f"{path}/shortcut", f"{path}/shortcut_norm")
                 yield from convolution(*names, (width, inputs), 1, *paths)
             inputs = width
-    yield from _layer("MVCNN.fc.0", (IMAGE_CLASSES, widths[-1]), None)
-
-
-def _transformer(flags: CMIGNetFlags) -> Iterator[Tensor]:
-    dim, hidden = flags.points.dim, flags.fusion.feed_forward
-    for half, attentions in (("encoder", ("self_attn",)), ("decoder", ("self_attn", "src_attn"))):
-        name, path = f"attn.model.{half}.layers.0", f"transformer/{half}"
-        for attention, own in zip(attentions, (f"{path}_attention", f"{path}_cross"), strict=False):
-            for i, role in enumerate(("query", "key", "value", "out")):
-                yield from _layer(f"{name}.{attention}.linears.{i}", (dim, dim), f"{own}/{role}")
-        yield from _layer(f"{name}.feed_forward.w_1", (hidden, dim), f"{path}_feed_forward/layer_0")
-        yield from _layer(f"{name}.feed_forward.w_2", (dim, hidden), f"{path}_feed_forward/layer_1")
-        for i, norm in enumerate([*(f"{name}.sublayer.{i}.norm" for i in range(len(attentions) + 1)), f"attn.model.{half}.norm"]):
-            for leaf, other in (("a_2", "scale"), ("b_2", "bias")):
-                yield Tensor(f"{norm}.{leaf}", (dim,), ("params", "transformer", f"{half}_norms_{i}", other))
+    yield from linear("MVCNN.fc.0", (IMAGE_CLASSES, widths[-1]), None)
 
 
 def _score(flags: CMIGNetFlags) -> Iterator[Tensor]:
     dim = flags.points.dim
     for i, (inputs, width) in enumerate(itertools.pairwise((2 * dim, dim, dim // 2, dim // 4, 1))):
-        yield from _layer(f"h3.{2 * i}", (width, inputs, 1), f"score/rest/layer_{i - 1}" if i else "score")
+        yield from linear(f"h3.{2 * i}", (width, inputs, 1), f"score/rest/layer_{i - 1}" if i else "score")

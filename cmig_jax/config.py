@@ -12,15 +12,17 @@ import itertools
 import math
 from collections.abc import Iterable, Iterator
 from contextvars import ContextVar
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import ClassVar, Literal
 
 Categories = Literal["all", "first-half", "second-half"]
 Kernels = Literal["auto", "plain", "fast"]
 Sampling = Literal["once", "twice", "subsets"]
-Crop = Literal["shared", "independent", "half-space", "none"]
+Crop = Literal["shared", "independent", "half-space", "source", "none"]
 Turn = Literal["positive", "either", "any"]
+Poses = Literal["euler", "twist"]
+Normals = Literal["object", "observed"]
 Layout = Literal["dodecahedron", "ring", "axes"]
 Rule = tuple[str, bool, str]
 """A flag and its value, whether it is valid, and what was expected."""
@@ -57,8 +59,8 @@ class DataConfig:
     source: str = "modelnet40-hdf5"
     """Kind of data, one of `cmig_jax/data/sources`: `shapes` (generated objects), `modelnet40-hdf5`, `meshes` (a folder of meshes or clouds
     per category), `stanford` (models), `sevenscenes` (fragments); or, for evaluation only, recorded pairs with their true pose:
-    `stanford-scans`, `sevenscenes-fragments`. Recorded pairs read only `root`, `prepared`, `points`, `keep`, `crop` (whether `none`),
-    `max-angle-deg` (pairs with a larger rotation are left out) and `test-seed`."""
+    `stanford-scans`, `sevenscenes-fragments`. Recorded pairs read only `root`, `prepared`, `points`, `keep`, `crop` (for the numbers of
+    points), `max-angle-deg` (pairs with a larger rotation are left out) and `test-seed`."""
     root: str | None = None
     """Folder of the raw data (`shapes` needs none)."""
     prepared: str | None = None
@@ -79,11 +81,15 @@ class DataConfig:
     keep: float = 0.75
     """Share of the points that the crop keeps (Sec. IV-B removes 25 %)."""
     crop: Crop = "shared"
-    """Crop around one far point for both clouds, one far point each (lower overlap), a random half-space each (RPM-Net), or no crop."""
+    """Crop around one far point for both clouds, one far point each (lower overlap), a random half-space each (RPM-Net), a far point for
+    the source alone with a complete target (`source`: MaskNet), or no crop."""
     noise_std: float = 0.01
     """Standard deviation of the Gaussian noise on every coordinate, object units; 0 turns noise off (Sec. IV-B)."""
     noise_clip: float = 0.05
     """Largest absolute noise, object units (Sec. IV-B)."""
+    pose: Poses = "euler"
+    """`euler`: rotation and translation as the next three flags say; `twist`: the exponential of a twist (w, v) of uniform direction in six
+    dimensions and of uniform length in [0, max_twist], whatever those say (PointNetLK, MaskNet)."""
     max_angle_deg: float = 45.0
     """Each of the three Euler angles is uniform in [0, this], degrees (Sec. IV-B)."""
     turn: Turn = "positive"
@@ -91,6 +97,12 @@ class DataConfig:
     max_angle_deg."""
     max_translation: float = 0.5
     """Each translation component is uniform in [-this, this], object units (Sec. IV-B)."""
+    max_twist: float = 0.8
+    """Largest length of a twist with `pose=twist`: w in radians, v in object units. It is also the largest angle of rotation."""
+    normals: Normals = "object"
+    """Normals of a network that reads them. `object`: of the complete object's surface, turned with it (RPM-Net): those of the faces of a
+    mesh, or of the file, else estimated from the cloud. `observed`: estimated from each cropped, noisy cloud. Recorded pairs and `register`
+    estimate them from the observed clouds in either case."""
     validation: float = 0.1
     """Share of the training objects held out to choose the checkpoint; the test split is never used for that."""
     test_seed: int = 1234
@@ -107,6 +119,7 @@ class DataConfig:
                 (f"data.noise_std = {self.noise_std}", 0 <= self.noise_std < math.inf, "0 or more"),
                 (f"data.noise_clip = {self.noise_clip}", self.noise_clip >= 0, "0 or more"),
                 (f"data.max_translation = {self.max_translation}", 0 <= self.max_translation < math.inf, "0 or more"),
+                (f"data.max_twist = {self.max_twist}", 0 <= self.max_twist < math.inf, "0 or more"),
                 (f"data.test_seed = {self.test_seed}", self.test_seed >= 0, "0 or more"),
                 (f"data.workers = {self.workers}", self.workers >= 0, "0 or more"),
                 (f"data.max_angle_deg = {self.max_angle_deg}", 0 <= self.max_angle_deg <= 180, "degrees in [0, 180]"),
@@ -117,8 +130,13 @@ class DataConfig:
 
     @property
     def cropped_points(self) -> int:
-        """Points per cloud after the crop."""
+        """Points after the crop: of each cloud, or of the source with `crop=source`."""
         return self.points if self.crop == "none" else round(self.points * self.keep)
+
+    @property
+    def target_points(self) -> int:
+        """Points of the target after the crop."""
+        return self.points if self.crop == "source" else self.cropped_points
 
 
 @dataclass(frozen=True)
@@ -270,14 +288,24 @@ class Config:
     compute: ComputeConfig = field(default_factory=ComputeConfig)
 
     def __post_init__(self) -> None:
-        pairs = self.model.needs.pairs
+        pairs, equal = self.model.needs.pairs, self.model.needs.equal_sizes
         check(
             [
                 (f"name = {self.name}", is_inside(self.name), "the name of a folder under runs/"),
                 (f"seed = {self.seed}", self.seed >= 0, "0 or more"),
                 (f"optim.batch = {self.optim.batch}", self.optim.batch >= pairs, f"at least {pairs} pairs for this network and its losses"),
+                (
+                    f"data.crop = {self.data.crop}",
+                    not (equal and self.data.crop == "source"),
+                    "another crop, since the network needs equal sizes",
+                ),
             ]
         )
+
+
+def views_to_prepare(config: Config) -> ViewsConfig:
+    """Return the views that prepared data must hold: those of the config, or none ahead of time for a network that reads none."""
+    return config.views if config.model.needs.views else replace(config.views, of="both")
 
 
 def is_inside(name: str) -> bool:

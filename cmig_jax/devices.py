@@ -61,6 +61,9 @@ def to_device(arrays: Mapping[str, np.ndarray], mesh: Mesh | None = None) -> Bat
             return jax.numpy.asarray(x)
         return jax.make_array_from_process_local_data(split(mesh), x)
 
+    def put_if_there(name: str) -> jax.Array | None:
+        return put(arrays[name]) if name in arrays else None
+
     views = arrays.get("views")
     pose = RigidTransform(R=put(arrays["R"]), t=put(arrays["t"])) if "R" in arrays else None
     return Batch(
@@ -68,4 +71,6 @@ def to_device(arrays: Mapping[str, np.ndarray], mesh: Mesh | None = None) -> Bat
         target=put(arrays["target"]),
         views=None if views is None else put(views[..., None]),
         target_from_source=pose,
+        source_normals=put_if_there("source_normals"),
+        target_normals=put_if_there("target_normals"),
     )

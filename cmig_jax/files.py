@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import hashlib
 import os
 import tokenize
 import zipfile
@@ -46,3 +47,9 @@ def remove_partial_files(folder: Path) -> None:
     """Remove the temporary files that killed processes left in a folder; for a folder that no other process writes to."""
     for path in folder.glob(f".*{MARK}*"):
         path.unlink(missing_ok=True)
+
+
+def sha256(path: Path) -> str:
+    """Return the SHA-256 of a file, in hexadecimal."""
+    with path.open("rb") as file:
+        return hashlib.file_digest(file, "sha256").hexdigest()

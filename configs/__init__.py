@@ -9,6 +9,7 @@ from collections.abc import Callable
 
 from cmig_jax.config import Config
 
+from .methods import METHODS
 from .modelnet40 import corrected, corrected_cpu, modelnet40_cpu, paper, paper_cpu, released, released_cpu
 from .quickstart import own_clouds, quickstart
 
@@ -22,4 +23,5 @@ PRESETS: dict[str, Callable[[], Config]] = {
     "paper-cpu": paper_cpu,
     "released-cpu": released_cpu,
     "corrected-cpu": corrected_cpu,
+    **METHODS,
 }

@@ -10,9 +10,11 @@ from __future__ import annotations
 from cmig_jax.data.protocol import SYMMETRIC
 from cmig_jax.experiments.schema import Experiment, Flags, Quoted, Row
 
+from .compared import PROTOCOL, compared
+
 UNCHANGED: Flags = {}
-CLEAN = {"data.noise_std": 0.0}
-NOISE = {"data.noise_std": 0.01, "data.noise_clip": 0.05}
+CLEAN: Flags = {**PROTOCOL, "data.noise_std": 0.0}
+NOISE: Flags = {**PROTOCOL, "data.noise_std": 0.01, "data.noise_clip": 0.05}
 UNSEEN = {"data.categories": "first-half", "data.test_categories": "second-half"}
 
 NO_IMAGES = {"model.fusion.image": "none", "model.loss.cross_modal": "off"}
@@ -59,22 +61,28 @@ FULL = Quoted(1.472, 0.632, 0.0058, 0.0036)
 
 EXPERIMENTS: dict[str, Experiment] = {
     "table1": Experiment(
-        "same categories in training and test, no noise", CLEAN, _three_presets(Quoted(0.772, 0.408, 0.0048, 0.0030)), baselines=True
+        "same categories in training and test, no noise",
+        CLEAN,
+        (*compared("table1"), *_three_presets(Quoted(0.772, 0.408, 0.0048, 0.0030))),
+        baselines=True,
     ),
     "table2": Experiment(
-        "unseen categories, no noise", CLEAN | UNSEEN, _three_presets(Quoted(0.842, 0.431, 0.0046, 0.0029)), baselines=True
+        "unseen categories, no noise",
+        {**CLEAN, **UNSEEN},
+        (*compared("table2"), *_three_presets(Quoted(0.842, 0.431, 0.0046, 0.0029))),
+        baselines=True,
     ),
-    "table3": Experiment("same categories, Gaussian noise", NOISE, _three_presets(FULL), baselines=True),
+    "table3": Experiment("same categories, Gaussian noise", NOISE, (*compared("table3"), *_three_presets(FULL)), baselines=True),
     "table4": Experiment(
         "Gaussian noise with lower overlap: a crop for each cloud on its own",
-        NOISE | {"data.crop": "independent"},
-        _three_presets(Quoted(4.341, 2.279, 0.0214, 0.0104)),
+        {**NOISE, "data.crop": "independent"},
+        (*compared("table4"), *_three_presets(Quoted(4.341, 2.279, 0.0214, 0.0104))),
         baselines=True,
     ),
     "table5": Experiment(
         "7-Scenes: trained on six scenes, tested on Office, 2,048 points cropped to 1,536",
-        CLEAN | {"data.source": "sevenscenes", "data.points": 2048},
-        _three_presets(Quoted(0.804, 0.488, 0.0032, 0.0018)),
+        {**CLEAN, "data.source": "sevenscenes", "data.points": 2048},
+        (*compared("table5"), *_three_presets(Quoted(0.804, 0.488, 0.0032, 0.0018))),
         baselines=True,
     ),
     "table6": Experiment(
@@ -146,7 +154,7 @@ EXPERIMENTS: dict[str, Experiment] = {
     ),
     "corrections": Experiment(
         "what each correction of the released network brings on its own: unseen categories with noise",
-        NOISE | UNSEEN,
+        {**NOISE, **UNSEEN},
         (
             Row("released", "released"),
             *(Row(f"released + {name}", "released", flags) for name, flags in CORRECTIONS.items()),
@@ -164,7 +172,7 @@ EXPERIMENTS: dict[str, Experiment] = {
     ),
     "twice": Experiment(
         "the clouds of a pair sampled independently: at test only, and in training too",
-        NOISE | UNSEEN,
+        {**NOISE, **UNSEEN},
         (
             Row("released", "released", test={"data.sampling": "twice"}),
             Row("released + all three at test", "released", test={"data.sampling": "twice"} | AT_TEST),
@@ -178,13 +186,15 @@ EXPERIMENTS: dict[str, Experiment] = {
             Row("corrected, trained so, then ICP", "corrected", {"data.sampling": "twice"}, then="ICP"),
             Row("released, trained so, then GICP", "released", {"data.sampling": "twice"}, then="GICP"),
             Row("corrected, trained so, then GICP", "corrected", {"data.sampling": "twice"}, then="GICP"),
+            *compared(flags={"data.sampling": "twice"}, suffix=", trained so"),
         ),
         baselines=True,
     ),
     "turns": Experiment(
         "rotations to either side, whose mean tells a method nothing; the mean of the paper's rotations to one side is half the pose",
-        NOISE | UNSEEN | {"data.turn": "either"},
+        {**NOISE, **UNSEEN, "data.turn": "either"},
         (
+            *compared(),
             *_three_presets(),
             Row("corrected, trained on one side", "corrected", {"data.turn": "positive"}, test={"data.turn": "either"}),
             Row("released, then ICP", "released", then="ICP"),
@@ -194,7 +204,7 @@ EXPERIMENTS: dict[str, Experiment] = {
     ),
     "images": Experiment(
         "do the images matter? real, those of another object, black, or a network without any",
-        NOISE | UNSEEN,
+        {**NOISE, **UNSEEN},
         (
             *(Row(f"released, {shown}", "released", test={"views.shown": shown}) for shown in ("real", "shuffled", "zero")),
             *(Row(f"corrected, {shown}", "corrected", test={"views.shown": shown}) for shown in ("real", "shuffled", "zero")),
@@ -202,23 +212,23 @@ EXPERIMENTS: dict[str, Experiment] = {
         ),
     ),
     "symmetric": Experiment(
-        "ModelNet40's eight symmetric categories left out", NOISE | {"data.exclude": SYMMETRIC}, _three_presets(), baselines=True
+        "ModelNet40's eight symmetric categories left out", {**NOISE, "data.exclude": SYMMETRIC}, _three_presets(), baselines=True
     ),
     "rpmnet": Experiment(
         "RPM-Net's protocol: each cloud from a subset of the points, a half-space crop each that keeps 70 %, unseen categories",
-        NOISE | UNSEEN | {"data.sampling": "subsets", "data.crop": "half-space", "data.keep": 0.7},
-        _three_presets(),
+        {**NOISE, **UNSEEN, "data.sampling": "subsets", "data.crop": "half-space", "data.keep": 0.7},
+        (*compared(), *_three_presets()),
         baselines=True,
     ),
     "scans": Experiment(
         "raw range scans of the Stanford bunny and the like, true partial pairs, by networks trained on clouds as independent as these",
-        NOISE | AS_RECORDED,
+        {**NOISE, **AS_RECORDED},
         _recorded("stanford-scans"),
         baselines=True,
     ),
     "fragments": Experiment(
         "neighbouring fragments of 7-Scenes, true partial pairs, by networks trained on clouds as independent as these",
-        NOISE | AS_RECORDED,
+        {**NOISE, **AS_RECORDED},
         _recorded("sevenscenes-fragments"),
         baselines=True,
     ),

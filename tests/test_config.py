@@ -20,6 +20,7 @@ REFUSED_BY_GROUP = [
     ("", {"name": ["", "../elsewhere", "/anywhere"], "seed": [-1]}),
     ("data.", {"points": [0], "keep": [0.0, 1.5, -0.1], "validation": [0.0, 1.0], "shapes": [3], "test_seed": [-1], "workers": [-1]}),
     ("data.", {"noise_std": [-0.01, math.inf], "noise_clip": [-0.05], "max_angle_deg": [-1.0, 181.0], "max_translation": [-0.5, math.inf]}),
+    ("data.", {"max_twist": [-0.1, math.inf]}),
     ("views.", {"count": [12, 0], "size": [7]}),
     ("model.points.", {"k": [0], "widths": [(), (64, 0)], "dim": [2]}),
     ("model.image.", {"widths": [(64, 128, 256, 511)], "blocks": [(2, 2, 2)]}),
@@ -95,7 +96,7 @@ def test_every_rule_is_tested_above(monkeypatch):
     for module in (cmig_jax.config, cmignet):
         monkeypatch.setattr(module, "check", lambda rules: ruled.update(name.split(" = ")[0] for name, _, _ in rules))
     Config(name="paper", model=cmignet.CMIGNetFlags())
-    assert ruled == set(REFUSED) | {"model.fusion.image"}
+    assert ruled == set(REFUSED) | {"model.fusion.image", "data.crop"}
 
 
 def test_tied_image_fusion_needs_the_transformer_whose_weights_it_shares():
@@ -113,6 +114,7 @@ def test_rules_hold_only_where_the_flag_is_used():
 
 def test_derived_numbers():
     assert [data.cropped_points for data in (DataConfig(), DataConfig(crop="none"), DataConfig(points=10, keep=0.7))] == [768, 1024, 7]
+    assert [DataConfig(crop=crop).target_points for crop in ("shared", "source", "none")] == [768, 1024, 1024]
     assert [ViewsConfig(of=of).sets for of in ("object", "source", "target", "both")] == [1, 1, 1, 2]
     assert [ComputeConfig(precision=precision).dtype for precision in ("float32", "bfloat16")] == [None, "bfloat16"]
 

@@ -1,6 +1,7 @@
 """The presets: each describes a network that can be built, and the settings that its name promises; the scales shrink them."""
 
 import functools
+from typing import Any
 
 import jax
 import numpy as np
@@ -26,16 +27,18 @@ def preset(request) -> Config:
 
 def abstract_batch(config: Config, pairs: int = 2) -> Batch:
     """Describe a batch of the preset's real sizes, without making it."""
-    views, points = config.views, config.data.cropped_points
+    views, data, needs = config.views, config.data, config.model.needs
 
     def array(*shape, dtype=np.float32):
         return jax.ShapeDtypeStruct((pairs, *shape), dtype)
 
     return Batch(
-        source=array(points, 3),
-        target=array(points, 3),
-        views=array(views.sets, views.count, views.size, views.size, 1, dtype=np.uint8),
+        source=array(data.cropped_points, 3),
+        target=array(data.target_points, 3),
+        views=array(views.sets, views.count, views.size, views.size, 1, dtype=np.uint8) if needs.views else None,
         target_from_source=RigidTransform(R=array(3, 3), t=array(3)),
+        source_normals=array(data.cropped_points, 3) if needs.normals else None,
+        target_normals=array(data.target_points, 3) if needs.normals else None,
     )
 
 
@@ -48,6 +51,12 @@ def test_a_preset_survives_its_own_json(preset):
 def test_a_preset_is_named_like_its_run_and_described(name):
     assert PRESETS[name]().name == name
     assert PRESETS[name].__doc__
+
+
+def assert_sized(prediction: Any, flags: CMIGNetFlags, iterations: int, keypoints: int) -> None:
+    assert len(prediction.iterations) == iterations
+    assert prediction.keypoints.source_index.shape == (2, keypoints)
+    assert (prediction.image_features is not None) == flags.needs.views
 
 
 def test_a_preset_describes_a_network_that_trains_and_predicts(preset):
@@ -66,31 +75,35 @@ def test_a_preset_describes_a_network_that_trains_and_predicts(preset):
     assert jax.tree.structure(updates["batch_stats"]) == jax.tree.structure(variables["batch_stats"])
     assert {loss.shape for loss in losses.values()} == {()}
     predicted = jax.eval_shape(functools.partial(predict, network), variables, batch.replace(target_from_source=None))
-    sizes = (
-        (flags.matching.iterations, flags.keypoints.count),
-        (flags.matching.iterations + flags.matching.repeats, flags.keypoints.test_count or flags.keypoints.count),
-    )
-    for prediction, (iterations, keypoints) in zip((trained, predicted), sizes, strict=True):
+    for prediction in (trained, predicted):
         assert isinstance(prediction, Prediction)
         assert prediction.target_from_source.R.shape == (2, 3, 3)
         assert prediction.target_from_source.t.shape == (2, 3)
-        assert len(prediction.iterations) == iterations
-        assert prediction.keypoints.source_index.shape == (2, keypoints)
-        assert (prediction.image_features is not None) == flags.needs.views
+    if isinstance(flags, CMIGNetFlags):
+        assert_sized(trained, flags, flags.matching.iterations, flags.keypoints.count)
+        iterations = flags.matching.iterations + flags.matching.repeats
+        assert_sized(predicted, flags, iterations, flags.keypoints.test_count or flags.keypoints.count)
     assert sum(x.size for x in jax.tree.leaves(variables["params"])) > 10_000
+
+
+DATA = {"name", "data.source", "data.sampling", "data.crop", "data.keep", "data.pose", "data.turn", "data.noise_std", "views.of"}
+MODEL = ("fusion.points", "fusion.image", "keypoints.select", "matching.head", "matching.repeats", "pose.centroid", "loss.cross_modal")
+METHODS = ("iterations", "pointer", "matching", "jacobian", "residual_loss", "loss", "cycle", "sinkhorn_rounds", "unmasked", "share")
 
 
 @pytest.mark.parametrize("scale", SCALES)
 def test_a_scale_keeps_what_is_computed_and_from_what_data(preset, scale):
     small = SCALES[scale](preset)
-    kept = ("fusion.points", "fusion.image", "keypoints.select", "matching.head", "matching.repeats", "pose.centroid", "loss.cross_modal")
-    kept = {f"model.{flag}" for flag in kept} | {"name", "data.source", "data.sampling", "data.crop", "data.keep", "views.of"}
+    kept = DATA | {f"model.{flag}" for flag in (*MODEL, *(METHODS if scale == "cpu" else ()))}
     assert not kept & {line.split(": ")[0] for line in differences(preset, small)}
     assert small == preset if scale == "full" else small == SCALES[scale](small)
     needs = small.model.needs
-    assert small.data.cropped_points >= max(needs.points, needs.training_points, small.model.keypoints.test_count)
-    assert (small.model.keypoints.test_count > 0) == (preset.model.keypoints.test_count > 0)
+    assert small.data.cropped_points >= max(needs.points, needs.training_points)
     assert small.optim.batch >= needs.pairs
+    if isinstance(small.model, CMIGNetFlags):
+        assert isinstance(preset.model, CMIGNetFlags)
+        assert small.data.cropped_points >= small.model.keypoints.test_count
+        assert (small.model.keypoints.test_count > 0) == (preset.model.keypoints.test_count > 0)
 
 
 def test_corrected_uses_observed_views_and_predicts_no_keypoints():

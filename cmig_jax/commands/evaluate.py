@@ -32,6 +32,8 @@ class Command:
     """Run folder or weights file; by default the network that comes with the package."""
     which: Literal["best", "last"] = "best"
     """Checkpoint of a run folder: the best on validation, or the last."""
+    mask: Path | None = None
+    """Run folder or weights file of a MaskNet, which then chooses the target's points that the network sees."""
     limit: int | None = None
     """Evaluate on this many test pairs, evenly spaced, instead of all."""
     batch: int = 16
@@ -80,6 +82,7 @@ def run(parsed: Parsed) -> int:
     from cmig_jax.evaluation.evaluate import evaluate_network
     from cmig_jax.evaluation.tables import text_table
     from cmig_jax.inference.load import load
+    from cmig_jax.inference.masked import behind_mask
     from cmig_jax.inference.run_folder import is_validated
     from cmig_jax.inference.weights_file import PRETRAINED, SUFFIX
     from cmig_jax.report.write import draw, write_report
@@ -94,6 +97,8 @@ def run(parsed: Parsed) -> int:
     keep_compiled_programs()
     path = command.network or PRETRAINED
     network, which, is_run = load(path, command.which, command.batch, config=parsed.config), command.which, path.suffix != SUFFIX
+    if command.mask is not None:
+        network = behind_mask(network, load(command.mask, command.which, command.batch))
     if is_run and which == "best" and not is_validated(path):
         print(f"{path}: none of its checkpoints was validated, so this is the last one, step {network.step}")
         which = "last"

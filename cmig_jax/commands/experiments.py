@@ -46,6 +46,10 @@ class Run:
     """Folder of the run folders and results, one folder for each scale in it."""
     limit: int | None = None
     """Evaluate on this many test pairs, evenly spaced, instead of all."""
+    rows: tuple[str, ...] = ()
+    """Run only the rows with these labels, as `list` names them; the tables show results of the others that exist."""
+    baselines: bool = True
+    """Also run the methods without learning."""
     only_collect: bool = False
     """Run nothing: write the tables of the results that exist."""
     jemalloc: bool = True
@@ -81,6 +85,9 @@ def run(parsed: Parsed) -> int:
     unknown = [name for name in names if name not in catalogue.experiments]
     if unknown or not names:
         raise ValueError(f"experiment {', '.join(unknown)!r}: expected all, or some of {', '.join(catalogue.experiments)}")
+    labels = {row.label for name in names for row in catalogue.experiments[name].rows}
+    if wrong := [label for label in command.rows if label not in labels]:
+        raise ValueError(f"row {', '.join(wrong)!r}: expected some of {', '.join(sorted(labels))}")
     if command.scale not in catalogue.scales:
         raise ValueError(f"scale = {command.scale!r}: expected one of {', '.join(catalogue.scales)}")
     from cmig_jax.compilation import keep_compiled_programs
@@ -96,7 +103,7 @@ def run(parsed: Parsed) -> int:
 
 def _run_one(command: Run, catalogue: Catalogue, name: str) -> bool:
     """Run an experiment, write its table, and return whether a row failed."""
-    from cmig_jax.experiments.run import collect
+    from cmig_jax.experiments.run import Results, collect
     from cmig_jax.experiments.run import run as run_jobs
 
     experiment, jobs = catalogue.experiments[name], jobs_of(command, catalogue, name)
@@ -104,7 +111,11 @@ def _run_one(command: Run, catalogue: Catalogue, name: str) -> bool:
     if command.only_collect:
         results = collect(jobs, with_baselines=experiment.baselines)
     else:
-        results = run_jobs(jobs, with_baselines=experiment.baselines)
+        chosen = [job for job in jobs if not command.rows or job.row.label in command.rows]
+        ran = run_jobs(chosen, with_baselines=experiment.baselines and command.baselines)
+        found = collect(jobs, with_baselines=experiment.baselines)
+        outcomes = {id(outcome.job): outcome for outcome in (*found.outcomes, *ran.outcomes)}
+        results = Results(tuple(outcomes[id(job)] for job in jobs), ran.baselines or found.baselines)
     write(command.runs / command.scale, name, experiment, results)
     return any(outcome.problem.startswith("failed") for outcome in results.outcomes)
 
@@ -133,7 +144,7 @@ def listing(catalogue: Catalogue) -> list[str]:
         lines += ["", f"{name}: {experiment.about}", f"  all rows: {_flags(experiment.protocol)}"]
         for row in experiment.rows:
             at_test = (f"; at test {_flags(row.test)}" if row.test else "") + (f"; then {row.then}" if row.then else "")
-            lines.append(f"  {row.label:26} {row.preset}: {_flags(row.flags)}{at_test}")
+            lines.append(f"  {row.label:26} {f'{row.preset}: {_flags(row.flags)}{at_test}' if row.preset else row.absent}")
     return lines[1:]
 
 
@@ -148,7 +159,7 @@ def write(folder: Path, name: str, experiment: Experiment, results: Results) -> 
     from cmig_jax.files import write_text
 
     folder.mkdir(parents=True, exist_ok=True)
-    text = table(experiment, results) + "".join(f"{line}\n" for line in notes(results))
+    text = table(experiment, results) + "".join(f"{line}\n" for line in notes(experiment, results))
     print(text, flush=True)
     write_text(folder / f"{name}.txt", text)
     write_text(folder / f"{name}.md", table(experiment, results, "markdown"))

@@ -10,6 +10,7 @@ from tyro.conf import Positional, arg, subcommand
 
 from cmig_jax.commands.parsing import parser_of
 from cmig_jax.config import Kernels
+from cmig_jax.parity.cases import State
 from cmig_jax.parity.rows import Dtype, Row, summary, table, used, write_json
 
 RELEASED = Path(__file__).parents[1] / "parity" / "released.npz"
@@ -40,10 +41,15 @@ class _Common:
 
 @dataclass(frozen=True)
 class Check(_Common):
-    """Hold CMIGNet to a recorded case of the released PyTorch network: one row per recorded result."""
+    """Hold a network to a recorded case of its PyTorch implementation: one row per recorded result."""
 
     case: Annotated[Positional[Path | None], arg(metavar="CASE.npz")] = None
-    """The recorded case; by default the one that comes with the package."""
+    """The recorded case; by default CMIGNet's, which comes with the package."""
+    method: str = "cmignet"
+    """What was recorded: `cmignet`, or another method (`cmig_jax/parity/methods`), by the name of its folder of recorded cases. Of
+    other methods only `seed`, `kernels`, `weights` and `json` are read, and all is computed in float64."""
+    weights: Path | None = None
+    """PyTorch file of the weights that the case was recorded with (default: the weights that `seed` names)."""
     dtype: Dtype = "float64"
     """float64 from end to end, or float32 stage by stage, each fed the reference's result of the stage before."""
     margins: tuple[float, float] | None = None
@@ -92,7 +98,10 @@ def run(command: Command) -> int:
 
             print("\n".join(convert(command.source, command.target)))
             return 0
-        rows = _check(command) if isinstance(command, Check) else _compare(command)
+        if isinstance(command, Compare):
+            rows = _compare(command)
+        else:
+            rows = _check(command) if command.method == "cmignet" else _check_method(command)
     except ModuleNotFoundError as error:
         package = (error.name or "").partition(".")[0]
         if package not in ("torch", "safetensors"):
@@ -114,13 +123,40 @@ def _check(command: Check) -> list[Row]:
     rows = []
     for number, case in enumerate(read_cases(command.case or RELEASED, INPUTS, TRAINING_INPUTS)):
         flags = flags_of_case(case, command.iterations, command.margins)
-        found = check(case, flags, named_weights(layout(flags), command.seed), command.dtype, command.kernels)
+        state = _read_weights(command.weights) if command.weights else named_weights(layout(flags), command.seed)
+        found = check(case, flags, state, command.dtype, command.kernels)
         rows += [replace(row, key=EVALUATION + row.key) for row in found] if number else found
         if command.margins is None and "loss_terms" in case.outputs and case.outputs["loss_terms"][1] != 0:
             print("the case was recorded with the overlap loss: name its margins with --margins P N")
     print(f"{table(rows)}\n")
     print(summary(rows, lambda key: key.split("/")[0] if key.startswith(("grad_norm/", "buffer_sum/", EVALUATION)) else "outputs"))
     return rows
+
+
+def _check_method(command: Check) -> list[Row]:
+    from cmig_jax.parity.cases import read_cases
+    from cmig_jax.parity.method import check_method, weights_of
+    from cmig_jax.parity.methods import METHODS
+
+    if command.method not in METHODS:
+        raise ValueError(f"method = {command.method!r}: expected cmignet, or one of {', '.join(METHODS)}")
+    if command.case is None:
+        raise ValueError(f"expected a recorded case of {command.method}: only CMIGNet's comes with the package")
+    if command.dtype != "float64":
+        raise ValueError(f"dtype = {command.dtype}: expected float64, in which the other methods are compared from end to end")
+    method = METHODS[command.method]
+    (case,) = read_cases(command.case, method.inputs, method.optional)
+    state = _read_weights(command.weights) if command.weights else weights_of(method, case, command.seed)
+    rows = check_method(method, case, state, command.kernels)
+    print(f"{table(rows)}\n")
+    print(summary(rows, lambda key: key.split("/")[0] if key.startswith(("grad_norm/", "buffer_sum/")) else "outputs"))
+    return rows
+
+
+def _read_weights(path: Path) -> State:
+    from cmig_jax.parity.torch_files import read_torch
+
+    return read_torch(path)
 
 
 def _compare(command: Compare) -> list[Row]:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import gzip
 import zlib
+from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Literal
@@ -13,8 +14,8 @@ import trimesh
 
 from cmig_jax.clouds import check_cloud
 from cmig_jax.data.formats import arrays, las, mesh_text, pcd, ply, scenes, text, velodyne
-from cmig_jax.data.formats.content import Content, Format, Parsed, moved_points
-from cmig_jax.data.raw import check_mesh, visible_files
+from cmig_jax.data.formats.content import Content, Format, Parsed, moved_points, without_normals
+from cmig_jax.data.raw import CloudWithNormals, check_mesh, visible_files
 from cmig_jax.files import replacing
 
 _TEXT, _SCENE = Format(text.read_text, text.encode_text), Format(scenes.read_scene, scenes.encode_scene)
@@ -57,6 +58,7 @@ class GeometryFile:
         dropped: number of rows that were left out since they are not finite.
         content: the file, with the attributes and rows that `points` lacks.
         unit: name of the unit where the file says it (3MF, GLB); it is not applied.
+        normals: function that reads the normals `[rows, 3]` of every row of the file; it returns None for a file without them.
     """
 
     path: Path
@@ -65,6 +67,7 @@ class GeometryFile:
     dropped: int
     content: Content
     unit: str | None = None
+    normals: Callable[[], np.ndarray | None] = without_normals
 
     @property
     def geometry(self) -> trimesh.Trimesh | np.ndarray:
@@ -105,6 +108,13 @@ def read_geometry(path: str | Path, invalid: Literal["error", "drop"] = "error")
 def read_object(path: str | Path) -> trimesh.Trimesh | np.ndarray:
     """Read a mesh, or the points `[P, 3]` float64 of a cloud (`read_geometry` says what raises)."""
     return read_geometry(path).geometry
+
+
+def read_object_and_normals(path: str | Path) -> trimesh.Trimesh | np.ndarray | CloudWithNormals:
+    """Read a mesh or a cloud as `read_object`; a cloud whose file has normals, with them."""
+    file = read_geometry(path)
+    normals = None if file.mesh is not None else file.normals()
+    return file.geometry if normals is None else CloudWithNormals(file.points, normals)
 
 
 def write_moved(path: str | Path, source: GeometryFile, target_from_source: np.ndarray) -> None:
@@ -172,7 +182,7 @@ def _checked(path: Path, parsed: Parsed, invalid: Literal["error", "drop"]) -> G
     except ValueError as error:
         hint = "" if finite.all() else '; invalid="drop" (cmig register --drop-invalid) leaves them out'
         raise ValueError(f"{error}{hint}") from error
-    return GeometryFile(path, cloud, None, dropped, parsed.content, parsed.unit)
+    return GeometryFile(path, cloud, None, dropped, parsed.content, parsed.unit, parsed.normals)
 
 
 def _said(error: Exception) -> str:

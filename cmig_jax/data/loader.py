@@ -12,7 +12,7 @@ from absl import flags
 from cmig_jax.config import Config
 from cmig_jax.data.pairs import Pair, Pairs
 
-TRAINING_KEYS = ("source", "target", "R", "t", "views")
+TRAINING_KEYS = ("source", "target", "R", "t", "views", "source_normals", "target_normals")
 
 
 class BatchIterator(Protocol):

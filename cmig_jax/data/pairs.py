@@ -1,7 +1,8 @@
 """Pairs of objects, as the networks and the evaluation read them.
 
 A pair is a dict of arrays: `source [N, 3]`, `target [M, 3]`, `R [3, 3]`, `t [3]` with `target = R source + t`, `views [S, V, H, W]`
-uint8, `object [P, 3]` the complete clean object in the source's frame, `label` and `index`.
+uint8, `object [P, 3]` the complete clean object in the source's frame, `label` and `index`; for a network that reads them also
+`source_normals [N, 3]` and `target_normals [M, 3]`.
 """
 
 from __future__ import annotations
@@ -13,6 +14,7 @@ from typing import Any
 import numpy as np
 
 from cmig_jax.config import Categories, DataConfig, ViewsConfig
+from cmig_jax.data.normals import observed_normals
 from cmig_jax.data.protocol import make_clouds
 from cmig_jax.data.render import render_views
 from cmig_jax.data.shards import Shards
@@ -29,10 +31,18 @@ class Pairs(Sequence[Pair]):
         data: flags of the protocol.
         views: flags of the views to attach; None attaches none.
         seed: seed of poses, crops and noise.
+        normals: whether to attach normals, as `data.normals` says; they change nothing else of a pair.
+
+    Raises:
+        ValueError: objects that were prepared without normals; the message has the command that adds them.
     """
 
-    def __init__(self, objects: Shards, indices: np.ndarray, data: DataConfig, views: ViewsConfig | None, seed: int) -> None:
-        self.objects, self.indices, self.data, self.views, self.seed = objects, indices, data, views, seed
+    def __init__(
+        self, objects: Shards, indices: np.ndarray, data: DataConfig, views: ViewsConfig | None, seed: int, *, normals: bool = False
+    ) -> None:
+        if normals and data.normals == "object":
+            objects.check_normals()
+        self.objects, self.indices, self.data, self.views, self.seed, self.normals = objects, indices, data, views, seed, normals
 
     def __len__(self) -> int:
         return len(self.indices)
@@ -55,7 +65,7 @@ class Pairs(Sequence[Pair]):
 
     def draw(self, position: int, rng: np.random.Generator) -> Pair:
         """Make a pair of the object at `position` with the caller's random numbers; `views.shown` changes nothing but its views."""
-        pair = make_pair(self.objects, int(self.indices[position]), self.data, rng)
+        pair = make_pair(self.objects, int(self.indices[position]), self.data, rng, normals=self.normals)
         if self.views is not None:
             pair["views"] = self._shown(pair, self.views, rng)
         return pair
@@ -77,15 +87,19 @@ def seeded(seed: int, name: str) -> np.random.Generator:
     return np.random.default_rng([seed, zlib.crc32(name.encode())])
 
 
-def make_pair(objects: Shards, index: int, data: DataConfig, rng: np.random.Generator) -> Pair:
-    """Draw a pair of one object, without views.
+def make_pair(objects: Shards, index: int, data: DataConfig, rng: np.random.Generator, *, normals: bool = False) -> Pair:
+    """Draw a pair of one object, without views; `normals` adds normals and changes nothing else.
 
     Raises:
-        ValueError: the object has too few points for `data.points` and `data.sampling`.
+        ValueError: the object has too few points for `data.points` and `data.sampling`, or was prepared without normals.
     """
     points = objects.points(index)
+    rows = np.concatenate([points, objects.normals(index)], axis=1) if normals and data.normals == "object" else points
+    clouds = make_clouds(rows, data, f"object {objects.names[index]}", rng)
+    if normals and data.normals == "observed":
+        clouds |= {f"{cloud}_normals": observed_normals(clouds[cloud]) for cloud in ("source", "target")}
     return {
-        **make_clouds(points, data, f"object {objects.names[index]}", rng),
+        **clouds,
         "object": np.asarray(points, np.float32),
         "label": np.int32(objects.labels[index]),
         "index": np.int32(index),

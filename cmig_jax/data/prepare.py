@@ -1,8 +1,9 @@
-"""Preparation: sample points on every object, render its views (Sec. III-A), and write both to disk, once.
+"""Preparation: sample points and normals of every object, render its views (Sec. III-A), and write them to disk, once.
 
 One process per core makes one shard at a time. A shard is written to temporary files, flushed, renamed, and only then recorded as
 complete: after an interruption, the same command continues and makes the same bytes. On a prepared folder the command compares all
-checksums and remakes only the shards that are missing or changed. `shards.py` describes the files.
+checksums and remakes only the shards that are missing, changed, or of an earlier version without normals. `shards.py` describes the
+files.
 """
 
 from __future__ import annotations
@@ -101,7 +102,7 @@ def available_cores() -> int:
 
 
 def _plan(data: DataConfig, views: ViewsConfig, raw: RawDataset, out: Path, completed: dict[str, dict[str, Any]]) -> list[Job]:
-    """Divide the objects into shards; keep completed shards of the same objects."""
+    """Divide the objects into shards; keep completed shards of the same objects, with normals."""
     points, rendered = _stored_points(data, raw), views if views.of == "object" else None
     jobs = []
     for split in ("train", "test"):
@@ -109,7 +110,7 @@ def _plan(data: DataConfig, views: ViewsConfig, raw: RawDataset, out: Path, comp
         for start in range(0, len(indices), OBJECTS_PER_SHARD):
             name, chosen = f"{split}-{start // OBJECTS_PER_SHARD:05d}", tuple(indices[start : start + OBJECTS_PER_SHARD])
             known = completed.get(name)
-            if known and (known["names"], known["labels"]) != names_and_labels(raw, chosen):
+            if known and ((known["names"], known["labels"]) != names_and_labels(raw, chosen) or "normals" not in known["files"]):
                 known = None
             jobs.append(Job(out, name, settings_of(data, views), points, rendered, chosen, known))
     return jobs

@@ -12,8 +12,17 @@ import trimesh
 
 from cmig_jax.clouds import check_cloud
 from cmig_jax.config import DataConfig
+from cmig_jax.data.normals import completed_normals
 
 Split = Literal["train", "test"]
+
+
+@dataclass(frozen=True)
+class CloudWithNormals:
+    """A cloud whose file has normals: `points [P, 3]` and `normals [P, 3]`, of any length."""
+
+    points: np.ndarray
+    normals: np.ndarray
 
 
 @dataclass(frozen=True)
@@ -32,7 +41,7 @@ class RawObject:
     name: str
     label: int
     split: Split
-    read: Callable[[], trimesh.Trimesh | np.ndarray]
+    read: Callable[[], trimesh.Trimesh | np.ndarray | CloudWithNormals]
     shuffled: bool = False
 
     def geometry(self) -> trimesh.Trimesh | np.ndarray:
@@ -41,8 +50,23 @@ class RawObject:
         Raises:
             ValueError: unreadable, no faces, no area, no points, or coordinates that are not finite; the message names the object.
         """
+        return self.geometry_and_normals()[0]
+
+    def geometry_and_normals(self) -> tuple[trimesh.Trimesh | np.ndarray, np.ndarray | None]:
+        """Read the geometry, and the unit normals `[P, 3]` of a cloud whose file has them; None for others.
+
+        Raises:
+            ValueError: as `geometry`, or normals of another shape than the points.
+        """
         value = self.read()
-        return check_mesh(value, self.name) if isinstance(value, trimesh.Trimesh) else check_cloud(value, self.name)
+        if isinstance(value, trimesh.Trimesh):
+            return check_mesh(value, self.name), None
+        if not isinstance(value, CloudWithNormals):
+            return check_cloud(value, self.name), None
+        points = check_cloud(value.points, self.name)
+        if np.shape(value.normals) != points.shape:
+            raise ValueError(f"{self.name}: normals of shape {np.shape(value.normals)}; expected {points.shape}, as the points")
+        return points, completed_normals(points, np.asarray(value.normals, np.float64))
 
 
 @dataclass(frozen=True)

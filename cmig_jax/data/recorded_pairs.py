@@ -14,6 +14,7 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from cmig_jax.config import DataConfig, ViewsConfig
+from cmig_jax.data.normals import observed_normals
 from cmig_jax.data.pairs import Pair, black, evenly_spaced, render_clouds, seeded
 from cmig_jax.data.recordings import between, read_manifest, read_recording
 from cmig_jax.data.sample import normalise_pair
@@ -30,6 +31,7 @@ class RecordedPairs(Sequence[Pair]):
         data: flags of the protocol.
         views: flags of the views to attach; None attaches none.
         limit: number of pairs, evenly spaced in the list; None: all.
+        normals: whether to attach normals, estimated from each recording before it is thinned; they change nothing else of a pair.
 
     Attributes:
         categories: names of the scenes, which `label` counts.
@@ -40,14 +42,16 @@ class RecordedPairs(Sequence[Pair]):
             does not show.
     """
 
-    def __init__(self, folder: Path, data: DataConfig, views: ViewsConfig | None, limit: int | None = None) -> None:
+    def __init__(
+        self, folder: Path, data: DataConfig, views: ViewsConfig | None, limit: int | None = None, *, normals: bool = False
+    ) -> None:
         if views is not None and views.of == "object":
             raise ValueError(
                 f"views.of = object with data.source = {data.source}: a recording has no complete object to render; "
                 "expected views.of = source, target or both"
             )
         manifest = read_manifest(folder)
-        self.folder, self.data, self.views = folder, data, views
+        self.folder, self.data, self.views, self.normals = folder, data, views, normals
         self.categories: tuple[str, ...] = tuple(manifest["categories"])
         self._recordings, self._pairs = manifest["recordings"], manifest["pairs"]
         angles = np.degrees([Rotation.from_matrix(self._target_from_source(i, j)[:3, :3]).magnitude() for i, j, _ in self._pairs])
@@ -80,9 +84,16 @@ class RecordedPairs(Sequence[Pair]):
         clouds = [read_recording(self.folder, recording["file"]) for recording in recordings]
         normalised, target_from_source = normalise_pair(*clouds), self._target_from_source(i, j)
         R, t = target_from_source[:3, :3], target_from_source[:3, 3]
+        source = self._thinned(normalised.source, self.data.cropped_points, recordings[0]["name"], rng)
+        target = self._thinned(normalised.target, self.data.target_points, recordings[1]["name"], rng)
+        normals = {}
+        if self.normals:
+            normals["source_normals"] = observed_normals(normalised.source, source)
+            normals["target_normals"] = observed_normals(normalised.target, target)
         return {
-            "source": self._thinned(normalised.source, recordings[0]["name"], rng),
-            "target": self._thinned(normalised.target, recordings[1]["name"], rng),
+            "source": source,
+            "target": target,
+            **normals,
             "R": R.astype(np.float32),
             "t": normalised.normalised_translation(R, t).astype(np.float32),
             "overlap": np.float32(share),
@@ -94,8 +105,7 @@ class RecordedPairs(Sequence[Pair]):
         source, target = (np.array(self._recordings[k]["world_from_sensor"]) for k in (i, j))
         return between(source, target)
 
-    def _thinned(self, cloud: np.ndarray, name: str, rng: np.random.Generator) -> np.ndarray:
-        count = self.data.cropped_points
+    def _thinned(self, cloud: np.ndarray, count: int, name: str, rng: np.random.Generator) -> np.ndarray:
         if len(cloud) < count:
             raise ValueError(f"{name} has {len(cloud)} points: expected at least {count}, from data.points and data.keep")
         return cloud[rng.choice(len(cloud), count, replace=False)].astype(np.float32)

@@ -27,6 +27,20 @@ def sample_surface(mesh: trimesh.Trimesh, count: int, rng: np.random.Generator) 
         `[P, 3]` float32 in the units of the mesh, in random order.
 
     Raises:
+        ValueError: as `sample_surface_and_normals`.
+    """
+    return sample_surface_and_normals(mesh, count, rng)[0]
+
+
+def sample_surface_and_normals(mesh: trimesh.Trimesh, count: int, rng: np.random.Generator) -> tuple[np.ndarray, np.ndarray]:
+    """Draw the points of `sample_surface`, and return the unit normals of their faces too.
+
+    A normal points to the side from which the corners of its face are in counter-clockwise order: outwards on a well-made mesh.
+
+    Returns:
+        Points and normals, `[P, 3]` float32 each.
+
+    Raises:
         ValueError: no faces, no area, coordinates that are not finite, or `count` below 1.
     """
     if count < 1:
@@ -34,12 +48,15 @@ def sample_surface(mesh: trimesh.Trimesh, count: int, rng: np.random.Generator) 
     check_mesh(mesh, "mesh")
     corners = np.asarray(mesh.vertices, np.float64)[np.asarray(mesh.faces)]
     edges = corners[:, 1:] - corners[:, :1]
-    area = np.cumsum(np.linalg.norm(np.cross(edges[:, 0], edges[:, 1]), axis=-1))
+    across = np.cross(edges[:, 0], edges[:, 1])
+    areas = np.linalg.norm(across, axis=-1)
+    area = np.cumsum(areas)
     face = np.searchsorted(area, rng.random(count) * area[-1], side="right").clip(max=len(area) - 1)
     # Reflecting the outer half of the parallelogram keeps the density uniform on the triangle.
     weight = rng.random((count, 2))
     weight = np.where(weight.sum(1, keepdims=True) > 1, 1 - weight, weight)
-    return (corners[face, 0] + np.einsum("pe,pec->pc", weight, edges[face])).astype(np.float32)
+    points = corners[face, 0] + np.einsum("pe,pec->pc", weight, edges[face])
+    return points.astype(np.float32), (across[face] / areas[face, None]).astype(np.float32)  # a face without area is never drawn
 
 
 def centre(points: NDArray[np.float64]) -> tuple[NDArray[np.float64], NDArray[np.float64], float]:

@@ -22,11 +22,12 @@ import numpy as np
 from tqdm import tqdm
 
 from cmig_jax.config import ViewsConfig
+from cmig_jax.data.normals import observed_normals
 from cmig_jax.data.raw import RawDataset, RawObject
 from cmig_jax.data.render import render_views
-from cmig_jax.data.sample import normalise, sample_surface
-from cmig_jax.data.shards import find_fault, sha256, write_note
-from cmig_jax.files import replacing
+from cmig_jax.data.sample import normalise, sample_surface_and_normals
+from cmig_jax.data.shards import find_fault, write_note
+from cmig_jax.files import replacing, sha256
 
 DENSE_POINTS = 16384
 """Points that a mesh is rendered from."""
@@ -46,7 +47,8 @@ class Job:
 
     def file_bytes(self) -> dict[str, int]:
         """Return the sizes of the arrays, without their headers."""
-        sizes = {"points": len(self.objects) * self.points * 3 * 4}
+        vectors = len(self.objects) * self.points * 3 * 4
+        sizes = {"points": vectors, "normals": vectors}
         if self.views is not None:
             sizes["views"] = len(self.objects) * self.views.count * self.views.size**2
         return sizes
@@ -150,30 +152,33 @@ def _make_shard(job: Job, raw: RawDataset, stopped: Callable[[], bool]) -> dict[
 
 
 def _arrays(job: Job, raw: RawDataset, stopped: Callable[[], bool]) -> tuple[dict[str, np.ndarray], list[int]]:
-    """Return `points [n, P, 3]` and, if the job asks for views, `views [n, V, H, W]`; and how many points of each object are distinct."""
-    points, views, distinct = [], [], []
+    """Return `points` and `normals [n, P, 3]`, `views [n, V, H, W]` if the job asks for them; and the distinct points of each object."""
+    points, normals, views, distinct = [], [], [], []
     for index in job.objects:
         if stopped():
             raise InterruptedError(f"{job.name}: stopped")
-        stored, dense = _sample(raw.objects[index], job.points)
+        stored, turned, dense = _sample(raw.objects[index], job.points)
         points.append(stored)
+        normals.append(turned)
         distinct.append(min(job.points, len(dense)))
         if job.views is not None:
             views.append(render_views(dense, layout=job.views.layout, count=job.views.count, size=job.views.size))
-    arrays = {"points": np.stack(points)}
+    arrays = {"points": np.stack(points), "normals": np.stack(normals)}
     return (arrays | {"views": np.stack(views)} if views else arrays), distinct
 
 
-def _sample(item: RawObject, count: int) -> tuple[np.ndarray, np.ndarray]:
-    """Return the points to store `[count, 3]`, in random order, and all points to render from, in the same frame."""
+def _sample(item: RawObject, count: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Return points to store `[count, 3]`, in random order, with their normals, and all points to render from, in the same frame."""
     rng = np.random.default_rng(zlib.crc32(f"{item.split}/{item.name}".encode()))
-    geometry = item.geometry()
+    geometry, normals = item.geometry_and_normals()
     if isinstance(geometry, np.ndarray):
         dense = normalise(geometry, item.name)
         order = np.arange(len(dense)) if item.shuffled else rng.permutation(len(dense))
-        return dense[np.resize(order, count)], dense  # a smaller cloud repeats its points; the manifest says how many are distinct
-    dense = normalise(sample_surface(geometry, max(DENSE_POINTS, count), rng), item.name)
-    return dense[:count], dense
+        chosen = np.resize(order, count)  # a smaller cloud repeats its points; the manifest says how many are distinct
+        return dense[chosen], observed_normals(dense, dense[chosen]) if normals is None else normals[chosen], dense
+    drawn, normals = sample_surface_and_normals(geometry, max(DENSE_POINTS, count), rng)
+    dense = normalise(drawn, item.name)
+    return dense[:count], normals[:count], dense
 
 
 def names_and_labels(raw: RawDataset, objects: tuple[int, ...]) -> tuple[list[str], list[int]]:

@@ -1,18 +1,18 @@
 """Prepared objects on disk: the format, and its reader.
 
-A prepared folder holds `manifest.json` and, per shard of n objects, two memory-mappable arrays:
+A prepared folder holds `manifest.json` and, per shard of n objects, up to three memory-mappable arrays:
 
     <split>-00000.points.npy   [n, P, 3] float32, points on the surface, in the unit sphere; a smaller cloud repeats its points
+    <split>-00000.normals.npy  [n, P, 3] float32, unit normals of these points; not in folders of earlier versions
     <split>-00000.views.npy    [n, V, H, W] uint8, depth views (Sec. III-A); only where `views.of` is `object`
 
-The manifest has every setting that the arrays depend on, the categories, and per split the shards with names, labels and numbers of
-distinct points of their objects and, per file, size and SHA-256. It is written last, so a folder with a manifest is complete.
+The manifest has the settings, the categories, and per split the shards with names, labels and numbers of distinct points of their
+objects and, per file, size and SHA-256. It is written last, so a folder with a manifest is complete.
 """
 
 from __future__ import annotations
 
 import contextlib
-import hashlib
 import json
 import shlex
 from collections.abc import Iterator, Mapping, Sequence
@@ -24,7 +24,7 @@ from filelock import FileLock
 
 from cmig_jax.config import DataConfig, ViewsConfig
 from cmig_jax.data.sources import source_of
-from cmig_jax.files import DAMAGED, remove_partial_files, write_text
+from cmig_jax.files import DAMAGED, remove_partial_files, sha256, write_text
 
 FORMAT = 2
 MANIFEST = "manifest.json"
@@ -75,6 +75,24 @@ class Shards:
         found = self._row(i, "points")
         assert found is not None
         return found[: self._distinct[i]]
+
+    def normals(self, i: int) -> np.ndarray:
+        """Return the unit normals of `points(i)`: `[P, 3]` float32, read only.
+
+        Raises:
+            ValueError: as `check_normals`.
+        """
+        found = self._row(i, "normals")
+        if found is None:
+            self.check_normals()
+        assert found is not None
+        return found[: self._distinct[i]]
+
+    def check_normals(self) -> None:
+        """Raise ValueError, with the command that adds them, if an earlier version has prepared this folder without normals."""
+        if any("normals" not in shard["files"] for shard in self._shards):
+            command = repair_command(self._manifest["settings"], self.folder)
+            raise ValueError(f"{self.folder} was prepared by an earlier version, without normals; add them with: {command}")
 
     def views(self, i: int) -> np.ndarray | None:
         """Return the depth views of object i: `[V, H, W]` uint8, read only; None where observed clouds are rendered instead."""
@@ -226,9 +244,3 @@ def find_fault(folder: Path, shard: Mapping[str, Any], *, checksum: bool) -> str
         if checksum and sha256(path) != file["sha256"]:
             return f"{path} has changed: its checksum is not that of the manifest"
     return None
-
-
-def sha256(path: Path) -> str:
-    """Return the SHA-256 of a file, in hexadecimal."""
-    with path.open("rb") as file:
-        return hashlib.file_digest(file, "sha256").hexdigest()

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from cmig_jax.config import Config
+from cmig_jax.config import Config, views_to_prepare
 from cmig_jax.data.pairs import Pairs, evenly_spaced, in_categories
 from cmig_jax.data.prepare import ensure_prepared
 from cmig_jax.data.recorded_pairs import RecordedPairs
@@ -15,7 +15,7 @@ def pairs_to_test(config: Config, limit: int | None = None) -> Pairs | RecordedP
     """Return the test pairs of a config: those of `data.test_categories`, or the recorded ones.
 
     Args:
-        config: `data`, `views`, and whether the network reads views.
+        config: `data`, `views`, and whether the network reads views and normals.
         limit: how many of them, evenly spaced; None: all.
 
     Raises:
@@ -27,11 +27,11 @@ def pairs_to_test(config: Config, limit: int | None = None) -> Pairs | RecordedP
         raise ValueError(f"{left}: expected at least {needs.points}, which the network needs")
     views = config.views if needs.views else None
     if source_of(data).records:
-        return RecordedPairs(ensure_recordings(data), data, views, limit)
-    objects = Shards(folder := ensure_prepared(data, config.views), "test")
+        return RecordedPairs(ensure_recordings(data), data, views, limit, normals=needs.normals)
+    objects = Shards(folder := ensure_prepared(data, views_to_prepare(config)), "test")
     chosen = in_categories(objects.labels, objects.categories, data.test_categories, data.exclude)
     chosen = chosen[evenly_spaced(len(chosen), limit)]
     if len(chosen) == 0:
         where = f"data.test_categories={data.test_categories} without data.exclude={data.exclude}"
         raise ValueError(f"{folder}: expected test objects in {where}, found none")
-    return Pairs(objects, chosen, data, views, data.test_seed)
+    return Pairs(objects, chosen, data, views, data.test_seed, normals=needs.normals)

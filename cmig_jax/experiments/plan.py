@@ -68,7 +68,7 @@ def plan(
     runs: Path,
     limit: int | None = None,
 ) -> list[Job]:
-    """List the jobs of an experiment, row by row.
+    """List the jobs of an experiment, row by row; a row without a preset has none.
 
     Args:
         experiment: the table or figure.
@@ -85,18 +85,18 @@ def plan(
     """
     at_scale = catalogue.scales[scale]
 
-    def job(row: Row, seed: int) -> Job:
-        preset = catalogue.presets[row.preset]()
+    def job(row: Row, name: str, seed: int) -> Job:
+        preset = catalogue.presets[name]()
         chosen = with_flags(preset, {"data.source": source} | dict(experiment.protocol) | dict(row.flags))
         scaled = changes(at_scale(preset), at_scale(chosen))  # what a scale sets for all rows is no difference
         differing = {f: v for f, v in changes(preset, chosen).items() if f in scaled and f not in ONLY_AT_TEST}
-        name = run_name(row.preset, differing, seed)
-        configs = (replace(at_scale(config), name=name, seed=seed) for config in (chosen, with_flags(chosen, row.test)))
+        run = run_name(name, differing, seed)
+        configs = (replace(at_scale(config), name=run, seed=seed) for config in (chosen, with_flags(chosen, row.test)))
         training, test = (_at_root(config, roots) for config in configs)
-        nearest = f"{row.preset}-{scale}" if f"{row.preset}-{scale}" in catalogue.presets else row.preset
-        return Job(row, seed, training, test, runs / name, (nearest, catalogue.presets[nearest]()), limit)
+        nearest = f"{name}-{scale}" if f"{name}-{scale}" in catalogue.presets else name
+        return Job(row, seed, training, test, runs / run, (nearest, catalogue.presets[nearest]()), limit)
 
-    return [job(row, seed) for row in experiment.rows for seed in seeds]
+    return [job(row, row.preset, seed) for row in experiment.rows if row.preset for seed in seeds]
 
 
 def _at_root(config: Config, roots: Mapping[str, str | None]) -> Config:

@@ -27,19 +27,21 @@ class Row:
 
     Attributes:
         label: name in the table.
-        preset: what the row starts from.
+        preset: what the row starts from; None for a method that cannot be run.
         flags: what it changes in training and test.
         test: what it changes at test only.
         then: refinement at test, by point-to-point or generalised ICP.
         quoted: the paper's figures.
+        absent: why there is nothing to run.
     """
 
     label: str
-    preset: str
+    preset: str | None
     flags: Flags = field(default_factory=dict)
     test: Flags = field(default_factory=dict)
     then: Literal["ICP", "GICP"] | None = None
     quoted: Quoted | None = None
+    absent: str = ""
 
 
 @dataclass(frozen=True)

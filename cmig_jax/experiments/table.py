@@ -37,9 +37,10 @@ def table(experiment: Experiment, results: Results, style: str = "text") -> str:
     return {"text": text_rows, "markdown": markdown_rows, "latex": latex_rows}[style]([headings], rows)
 
 
-def notes(results: Results) -> list[str]:
-    """Say of every job that has no result why, a line each."""
-    return [f"{o.job.row.label}, seed {o.job.seed}: {o.problem}" for o in results.outcomes if o.problem]
+def notes(experiment: Experiment, results: Results) -> list[str]:
+    """Say of every row and job that has no result why, a line each."""
+    absent = [f"{row.label}: {row.absent}" for row in experiment.rows if row.absent]
+    return absent + [f"{o.job.row.label}, seed {o.job.seed}: {o.problem}" for o in results.outcomes if o.problem]
 
 
 def as_json(name: str, experiment: Experiment, results: Results) -> dict[str, Any]:
@@ -51,6 +52,7 @@ def as_json(name: str, experiment: Experiment, results: Results) -> dict[str, An
             {
                 "label": row.label,
                 "preset": row.preset,
+                "absent": row.absent,
                 "flags": dict(experiment.protocol) | dict(row.flags),
                 "test_flags": dict(row.test),
                 "then": row.then,

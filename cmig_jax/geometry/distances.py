@@ -36,3 +36,25 @@ def pair_distances(a: Array, b: Array) -> Array:
         norms = jnp.sum(a**2, axis=-1)[:, :, None] + jnp.sum(b**2, axis=-1)[:, None]
         zero = square <= 4 * jnp.finfo(square.dtype).eps * norms
     return jnp.where(zero, 0, jnp.sqrt(jnp.where(zero, 1, square)))
+
+
+def chamfer_distance(a: Array, b: Array) -> Array:
+    """Return the mean distance from a point to the nearest of the other set, averaged over both directions, `[...]`.
+
+    Distances are not squared; where one is 0, so is its derivative.
+
+    Args:
+        a: `[..., N, C]` points.
+        b: `[..., M, C]` points.
+    """
+    square = squared_distances(*jax.lax.stop_gradient((a, b)))
+    of_a, of_b = jnp.argmin(square, axis=-1)[..., None], jnp.argmin(square, axis=-2)[..., None]
+    there = _length(a - jnp.take_along_axis(b, of_a, axis=-2))
+    back = _length(b - jnp.take_along_axis(a, of_b, axis=-2))
+    return (jnp.mean(there, axis=-1) + jnp.mean(back, axis=-1)) / 2
+
+
+def _length(x: Array) -> Array:
+    square = jnp.sum(x**2, axis=-1)
+    zero = square == 0
+    return jnp.where(zero, 0, jnp.sqrt(jnp.where(zero, 1, square)))

@@ -7,8 +7,17 @@ from cmig_jax.config_json import from_values, parse_json
 from cmig_jax.models.base import Model
 from cmig_jax.models.cmignet.flags import upgraded
 from cmig_jax.models.cmignet.model import CMIGNET
+from cmig_jax.models.dcp.network import DCP
+from cmig_jax.models.finet.network import FINET
+from cmig_jax.models.idam.network import IDAM
+from cmig_jax.models.masknet.network import MASKNET
+from cmig_jax.models.omnet.network import OMNET
+from cmig_jax.models.pcrnet.network import PCRNET
+from cmig_jax.models.pointnetlk.network import POINTNETLK
+from cmig_jax.models.prnet.network import PRNET
+from cmig_jax.models.rpmnet.network import RPMNET
 
-NETWORKS: dict[str, Model] = {model.name: model for model in (CMIGNET,)}
+NETWORKS: dict[str, Model] = {model.name: model for model in (CMIGNET, POINTNETLK, DCP, PRNET, IDAM, RPMNET, PCRNET, MASKNET, OMNET, FINET)}
 
 
 def model_of(flags: ModelFlags) -> Model:

@@ -17,19 +17,27 @@ from cmig_jax.ops.attention import attend
 
 
 class PairTransformer(nn.Module):
-    """One pre-norm encoder layer and one pre-norm decoder layer, each with a last norm; no dropout."""
+    """One pre-norm encoder layer and one pre-norm decoder layer, each with a last norm; no dropout.
+
+    Attributes:
+        dim: channels.
+        heads: of the attention.
+        feed_forward: hidden channels of the feed-forward layers.
+        negative_slope: of their activation; 0 is ReLU.
+    """
 
     dim: int = 512
     heads: int = 4
     feed_forward: int = 1024
     compute: ComputeConfig = ComputeConfig()
+    negative_slope: float = 0.0
 
     def setup(self) -> None:
         def attention() -> Attention:
             return Attention(self.dim, self.heads, self.compute)
 
-        def feed_forward() -> MLP:
-            return MLP((self.feed_forward, self.dim), self.compute)
+        def feed_forward() -> FeedForward:
+            return FeedForward(self.feed_forward, self.dim, self.compute, self.negative_slope)
 
         self.encoder_attention, self.encoder_feed_forward = attention(), feed_forward()
         self.encoder_norms = [LayerNorm() for _ in range(3)]
@@ -56,6 +64,22 @@ class PairTransformer(nn.Module):
         x = x + self.decoder_cross(norms[1](x), memory)
         x = x + self.decoder_feed_forward(norms[2](x))
         return norms[3](x)
+
+
+class FeedForward(nn.Module):
+    """Two linear layers with bias and a (leaky) ReLU between them."""
+
+    hidden: int
+    dim: int
+    compute: ComputeConfig
+    negative_slope: float
+
+    @nn.compact
+    def __call__(self, x: Array) -> Array:
+        """Map `x [..., C]` to `[..., dim]`."""
+        x = Dense(self.hidden, compute=self.compute, name="layer_0")(x)
+        x = nn.leaky_relu(x, self.negative_slope) if self.negative_slope else nn.relu(x)
+        return Dense(self.dim, compute=self.compute, name="layer_1")(x)
 
 
 class Attention(nn.Module):

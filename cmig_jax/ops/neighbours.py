@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from typing import Literal
+
 import jax
 import jax.numpy as jnp
 from jax import Array
@@ -31,6 +33,36 @@ def knn(points: Array, k: int, compute: ComputeConfig) -> Array:
         return top_k(-square.reshape(-1, square.shape[-1]), k).reshape(*square.shape[:-1], k)
 
     return map_rows(block, points, compute.rows)
+
+
+def within_radius(points: Array, radius: float, k: int, by: Literal["index", "nearest"], compute: ComputeConfig) -> Array:
+    """Return the indices `[..., N, k]` of up to k points within a radius (inclusive) of each point, itself left out.
+
+    Where there are fewer than k, the rest is the point itself.
+
+    Args:
+        points: `[..., N, C]`.
+        radius: in the unit of the points.
+        k: neighbours.
+        by: which ones if there are more than k, and in which order: the first by index, or the nearest.
+        compute: `kernels`, and `rows`, the rows of the distance matrix per chunk.
+    """
+    points = jax.lax.stop_gradient(points)
+    N = points.shape[-2]
+    column = jnp.arange(N)
+
+    def block(own: Array) -> Array:
+        square = squared_distances(jnp.take_along_axis(points, own, axis=-2), points)
+        inside = (square <= radius**2) & (own != column.reshape((1,) * (own.ndim - 1) + (N,)))
+        # float32, which holds every index below 2**24: XLA's CPU compiler has a fast top-k for no other type.
+        order = jnp.broadcast_to(column, inside.shape) if by == "index" else square
+        score = jnp.where(inside, -order.astype(jnp.float32), -jnp.inf)
+        chosen = top_k(score.reshape(-1, N), min(k, N)).reshape(*inside.shape[:-1], -1)
+        neighbours = jnp.where(jnp.take_along_axis(inside, chosen, axis=-1), chosen, own)
+        return jnp.concatenate([neighbours, jnp.broadcast_to(own, (*own.shape[:-1], max(k - N, 0)))], axis=-1)
+
+    rows = jnp.broadcast_to(column[:, None], (*points.shape[:-1], 1))
+    return map_rows(block, rows, compute.rows)
 
 
 def top_k(x: Array, k: int) -> Array:

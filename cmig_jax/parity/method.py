@@ -5,6 +5,7 @@ A case is a training case if it has gradients. In training the recorded draws ar
 
 from __future__ import annotations
 
+import itertools
 from collections import Counter
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
@@ -21,7 +22,7 @@ from cmig_jax.config import ComputeConfig, Kernels, ModelFlags
 from cmig_jax.models.networks import model_of
 from cmig_jax.parity.cases import Arrays, Case, State
 from cmig_jax.parity.rows import Row, compare_all
-from cmig_jax.parity.weights import Layout, by_torch_name, named_weights, to_flax
+from cmig_jax.parity.weights import COUNTER, Layout, by_torch_name, named_weights, to_flax
 from cmig_jax.structs import Batch, Prediction
 
 Stages = Mapping[str, Callable[[int], Sequence[str]]]
@@ -50,6 +51,7 @@ class Method:
 
     Attributes:
         name: folder of the recorded cases, and value of `--method`.
+        network: key of the network in `models.networks.NETWORKS`.
         flags_of_case: the flags of the network that a case was recorded with.
         flags_of_state: the flags of a network with a state's shapes; raises ValueError for another network's state.
         layout: the tensors of its `state_dict`, in order.
@@ -64,6 +66,7 @@ class Method:
     """
 
     name: str
+    network: str
     flags_of_case: Callable[[Case], ModelFlags]
     flags_of_state: Callable[[State], ModelFlags]
     layout: Callable[[Any], Layout]
@@ -72,22 +75,25 @@ class Method:
     stages: Stages
     results: Callable[[Outcome], Arrays]
     optional: tuple[str, ...] = ()
-    draws: Callable[[Arrays], Mapping[str, NDArray]] = lambda _: {}
+    draws: Callable[[Case], Mapping[str, NDArray]] = lambda _: {}
     overrides: Callable[[Case], Mapping[str, tuple[str, Any]]] = lambda _: {}
     with_loss: bool = True
 
 
 class Watch:
-    """Interceptor that notes what the watched methods of modules return."""
+    """Interceptor that notes what the watched methods of modules return, and counts the batches that each BatchNorm has normalised."""
 
     def __init__(self, stages: Stages) -> None:
         self.seen: dict[str, Array] = {}
+        self.batches = Counter[tuple[str, ...]]()
         self._stages, self._calls = stages, Counter[str]()
 
     def __call__(self, call: Callable[..., Any], args: tuple[Any, ...], kwargs: dict[str, Any], context: Any) -> Any:
         """Run a method, and note its result."""
         stage = f"{type(context.module).__name__}.{context.method_name}"
         result = call(*args, **kwargs)
+        if stage == "BatchNorm.affine" and args[0] is not None:
+            self.batches[context.module.path] += 1
         if stage in self._stages:
             names = self._stages[stage](self._calls[stage])
             self.seen |= dict(zip(names, jax.tree.leaves(result), strict=True)) if names else {}
@@ -121,11 +127,13 @@ def run_method(method: Method, case: Case, state: State, kernels: Kernels = "aut
     compute = ComputeConfig(kernels=kernels)
     network, layout = model.build(flags, compute), method.layout(flags)
 
+    watch = Watch(method.stages)
+
     def forward(params: Any, statistics: Any, batch: Batch, draws: Mapping[str, Array]) -> tuple[Array, Any]:
-        watch = Watch(method.stages)
         with nn.intercept_methods(watch):
             variables = {"params": params, "batch_stats": statistics}
-            prediction, new = network.apply(variables, batch, train=train, key=None, mutable=["batch_stats"], **draws)
+            options: dict[str, Any] = {"train": train, "key": None, "mutable": ["batch_stats"], **draws}
+            prediction, new = network.apply(variables, batch, **options)
         assert isinstance(prediction, Prediction)
         terms = model.losses(prediction, batch, flags, compute) if train or method.with_loss else {}
         return sum(terms.values(), jnp.zeros(())), (watch.seen, prediction, terms, new.get("batch_stats", {}))
@@ -133,7 +141,7 @@ def run_method(method: Method, case: Case, state: State, kernels: Kernels = "aut
     with jax.enable_x64(True):
         variables, _ = to_flax(state, layout)
         params, statistics = (_wide(variables.get(kind, {})) for kind in ("params", "batch_stats"))
-        batch, draws = _wide(method.batch(case.inputs)), {k: jnp.asarray(v) for k, v in method.draws(case.inputs).items()}
+        batch, draws = _wide(method.batch(case.inputs)), {k: jnp.asarray(v) for k, v in method.draws(case).items()}
         if train:
             (_, found), gradients = jax.jit(jax.value_and_grad(forward, has_aux=True))(params, statistics, batch, draws)
         else:
@@ -143,6 +151,9 @@ def run_method(method: Method, case: Case, state: State, kernels: Kernels = "aut
     results = method.results(Outcome(seen, prediction, terms, case.inputs))
     if terms:
         results = {"loss": np.asarray(sum(terms.values())), **results}
+    for before, tensor in itertools.pairwise(layout if train else ()):  # a norm's counter follows its running statistics
+        if tensor.name.endswith(COUNTER) and before.path:
+            results[f"statistics/{tensor.name}"] = np.asarray(watch.batches[before.path[1:-1]])
     trees = {"gradient": {"params": gradients}, "statistics": {"batch_stats": new if train else {}}}
     return results | {f"{kind}/{name}": x for kind, tree in trees.items() for name, x in by_torch_name(tree, layout).items()}
 

@@ -11,7 +11,7 @@ from typing import Any
 
 import numpy as np
 
-from cmig_jax.config import Config, ViewsConfig
+from cmig_jax.config import Config, DataConfig, ViewsConfig
 from cmig_jax.data.sources import source_of
 from cmig_jax.evaluation.engine import MATCH_DISTANCE
 from cmig_jax.evaluation.errors import Errors
@@ -69,16 +69,22 @@ def protocol(config: Config, pairs: int) -> str:
     data, views = config.data, config.views
     shown = "" if views.shown == "real" else f"; views: {views.shown}"
     if source_of(data).records:
-        return (
-            f"{data.source}, {pairs} recorded pairs turned by up to {data.max_angle_deg:g}°, {data.cropped_points} points per cloud{shown}"
-        )
+        return f"{data.source}, {pairs} recorded pairs turned by up to {data.max_angle_deg:g}°, {_points(data)} points per cloud{shown}"
     categories = f"{data.test_categories} categories" + (f" without {', '.join(data.exclude)}" if data.exclude else "")
-    crop = "no crop" if data.crop == "none" else f"{data.crop} crop to {data.keep:.0%}"
+    crop = {"none": "no crop", "source": f"source cropped to {data.keep:.0%}"}.get(data.crop, f"{data.crop} crop to {data.keep:.0%}")
     noise = f"noise {data.noise_std:g} clipped at {data.noise_clip:g}" if data.noise_std > 0 else "no noise"
     turn = " to either side" if data.turn == "either" else ""
     rotations = "any rotation" if data.turn == "any" else f"rotations up to {data.max_angle_deg:g}° per axis{turn}"
     pose = f"{rotations}, translations up to {data.max_translation:g}"
-    return f"{data.source}, {categories}, {pairs} pairs; {data.points} points sampled {data.sampling}, {crop}, {noise}; {pose}{shown}"
+    pose = f"twists up to {data.max_twist:g}" if data.pose == "twist" else pose
+    normals = f", normals: {data.normals}" if config.model.needs.normals else ""
+    made = f"{data.points} points sampled {data.sampling}, {crop}, {noise}{normals}"
+    return f"{data.source}, {categories}, {pairs} pairs; {made}; {pose}{shown}"
+
+
+def _points(data: DataConfig) -> str:
+    source, target = data.cropped_points, data.target_points
+    return f"{source}" if source == target else f"{source} and {target}"
 
 
 def _facts(report: Report) -> str:

@@ -4,11 +4,15 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from scipy.integrate import solve_ivp
+from scipy.linalg import logm
 from scipy.spatial.transform import Rotation
 
 from cmig_jax.config import DataConfig
 from cmig_jax.data.protocol import (
     crop,
+    draw_pose,
+    exponential,
     keep_farthest_along,
     keep_nearest,
     largest_rotation_deg,
@@ -82,6 +86,47 @@ def test_any_rotation_is_uniform_over_the_sphere():
     assert (mean_angle_deg(DataConfig(turn="any")), largest_rotation_deg(DataConfig(turn="any"))) == (0, 180)
 
 
+TWISTS = np.random.default_rng(5).normal(size=(4, 6)) * [[1], [3], [1e-5], [0]]
+
+
+@pytest.mark.parametrize("twist", TWISTS)
+def test_the_exponential_of_a_twist_is_where_its_motion_ends_after_a_unit_of_time(twist):
+    R, t = exponential(twist)
+    np.testing.assert_allclose(R, Rotation.from_rotvec(twist[:3]).as_matrix(), atol=1e-12)
+    end = solve_ivp(lambda _, x: np.cross(twist[:3], x) + twist[3:], (0, 1), np.zeros(3), rtol=1e-10, atol=1e-12).y[:, -1]
+    np.testing.assert_allclose(t, end, atol=1e-8)
+    back = exponential(-twist)
+    np.testing.assert_allclose(back[0] @ R, np.eye(3), atol=1e-12)
+    np.testing.assert_allclose(back[0] @ t + back[1], 0, atol=1e-12)
+
+
+@pytest.mark.parametrize("longest", [0.8, 2.0])
+def test_twists_have_a_uniform_direction_and_a_uniform_length(longest):
+    data, rng = DataConfig(pose="twist", max_twist=longest, turn="positive"), np.random.default_rng(0)
+    poses = [draw_pose(rng, data) for _ in range(3000)]
+    twists = np.array([logarithm(R, t) for R, t in poses])
+    length = np.linalg.norm(twists, axis=1)
+    assert length.max() <= longest + 1e-9
+    np.testing.assert_allclose(
+        np.quantile(length, [0.1, 0.25, 0.5, 0.75, 0.9, 1]), longest * np.array([0.1, 0.25, 0.5, 0.75, 0.9, 1]), atol=0.04
+    )
+    direction = twists / length[:, None]
+    np.testing.assert_allclose(direction.mean(0), 0, atol=0.03)
+    np.testing.assert_allclose(direction.T @ direction / 3000, np.eye(6) / 6, atol=0.02)
+    assert abs(np.corrcoef(length, np.abs(direction[:, 0]))[0, 1]) < 0.06
+    largest = np.degrees(np.linalg.norm(twists[:, :3], axis=1)).max()
+    assert 0.95 * largest_rotation_deg(data) < largest <= largest_rotation_deg(data) == pytest.approx(np.degrees(longest))
+    assert largest_rotation_deg(replace(data, max_twist=4.0)) == 180
+    angles = np.stack([Rotation.from_matrix(R).as_euler("XYZ", degrees=True) for R, _ in poses])
+    np.testing.assert_allclose(angles.mean(0), mean_angle_deg(data), atol=1.5)
+
+
+def logarithm(R, t):
+    """Return the twist of a pose, from the matrix logarithm."""
+    found = logm(np.block([[R, t[:, None]], [np.zeros((1, 3)), 1]])).real
+    return np.array([found[2, 1], found[0, 2], found[1, 0], *found[:3, 3]])
+
+
 @pytest.mark.parametrize("seed", range(3))
 def test_euler_matrices_multiply_in_the_order_of_the_paper(seed):
     x, y, z = np.random.default_rng(seed).uniform(0, 45, 3)
@@ -90,12 +135,20 @@ def test_euler_matrices_multiply_in_the_order_of_the_paper(seed):
     np.testing.assert_allclose(R, single[0] @ single[1] @ single[2], atol=1e-12)
 
 
-@pytest.mark.parametrize("kind", ["shared", "independent", "half-space", "none"])
+@pytest.mark.parametrize("kind", ["shared", "independent", "half-space", "source", "none"])
 @pytest.mark.parametrize("keep", [0.75, 0.501, 0.05, 1.0])
 def test_the_crop_keeps_exactly_its_share(kind, keep):
     data = DataConfig(points=100, keep=keep, crop=kind)
     pair = draw(data)
-    assert len(pair["source"]) == len(pair["target"]) == data.cropped_points == (100 if kind == "none" else round(100 * keep))
+    assert len(pair["source"]) == data.cropped_points == (100 if kind == "none" else round(100 * keep))
+    assert len(pair["target"]) == data.target_points == (100 if kind == "source" else data.cropped_points)
+
+
+def test_a_crop_of_the_source_alone_is_that_of_both_with_a_complete_target():
+    data = DataConfig(points=100, keep=0.6)
+    both, one, none = (draw(replace(data, crop=kind)) for kind in ("shared", "source", "none"))
+    np.testing.assert_array_equal(one["source"], both["source"])
+    np.testing.assert_array_equal(one["target"], none["target"])
 
 
 @pytest.mark.parametrize("keep", [0.75, 0.501, 0.05, 1.0])

@@ -8,6 +8,7 @@ from scipy.spatial import KDTree
 from scipy.spatial.transform import Rotation
 
 from cmig_jax.config import DataConfig, ViewsConfig
+from cmig_jax.data.normals import estimate_normals
 from cmig_jax.data.pairs import render_clouds
 from cmig_jax.data.recorded_pairs import RecordedPairs
 from cmig_jax.data.recordings import ensure_recordings
@@ -68,6 +69,23 @@ def test_a_pair_has_as_many_points_as_a_cropped_one(data):
             pairs[position]
     with pytest.raises(ValueError, match=r"toy/toy0 has 1200 points: expected at least 1201, from data\.points and data\.keep"):
         pairs_of(replace(data, points=1201))[0]
+
+
+def test_a_crop_of_the_source_alone_leaves_the_target_its_number_of_points(data):
+    pair = pairs_of(replace(data, points=400, crop="source", keep=0.75), None)[0]
+    assert (pair["source"].shape, pair["target"].shape) == ((300, 3), (400, 3))
+
+
+@pytest.mark.parametrize("kind", ["object", "observed"])
+def test_normals_are_those_of_the_whole_recordings_and_change_nothing_else(data, kind):
+    few = replace(data, points=400, normals=kind)
+    every, without = pairs_of(data, None)[1], pairs_of(few, None)[1]
+    pair = RecordedPairs(ensure_recordings(few, progress=False), few, None, normals=True)[1]
+    assert set(pair) - set(without) == {"source_normals", "target_normals"}
+    assert_same(pair, without, without)
+    for cloud in ("source", "target"):
+        assert pair[f"{cloud}_normals"].dtype == np.float32
+        np.testing.assert_allclose(pair[f"{cloud}_normals"], estimate_normals(every[cloud], at=pair[cloud]), atol=1e-3)
 
 
 @pytest.mark.parametrize("shown", ["real", "shuffled"])

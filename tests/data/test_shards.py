@@ -165,7 +165,7 @@ def test_a_full_disk_leaves_no_incomplete_file(data, prepared_meshes, contents, 
 def test_too_little_space_is_an_error_before_anything_is_written(data, tmp_path, monkeypatch):
     usage = shutil.disk_usage(tmp_path)
     monkeypatch.setattr(preparation.shutil, "disk_usage", lambda _: usage._replace(free=1000))
-    needed = 10 * (2048 * 12 + 6 * 16 * 16)
+    needed = 10 * (2048 * 24 + 6 * 16 * 16)
     with pytest.raises(OSError, match=rf"{tmp_path / 'out'}: {needed} bytes needed, 1000 free") as caught:
         prepare(data, VIEWS, tmp_path / "out", progress=False)
     assert caught.value.errno == errno.ENOSPC

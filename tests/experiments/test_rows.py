@@ -10,9 +10,11 @@ import pytest
 from cmig_jax.devices import device_mesh
 from cmig_jax.experiments.plan import plan, run_name, with_flags
 from cmig_jax.models.base import predict, smallest_batch
+from cmig_jax.models.cmignet.flags import CMIGNetFlags
 from cmig_jax.training.optim import optimizer
 from cmig_jax.training.state import abstract_state, build, make_step
 from configs.catalogue import catalogue
+from configs.compared import METHODS
 from configs.experiments import EXPERIMENTS
 
 COMPUTED_ALIKE = ("data.", "views.shown")
@@ -25,7 +27,9 @@ def distinct(*, tested):
     for experiment in EXPERIMENTS.values():
         for job in plan(experiment, catalogue(), scale="toy", roots={}, source="shapes", seeds=(0,), runs=Path("runs")):
             flags = {**job.row.flags, **(job.row.test if tested else {})}
-            if "model.matching.iterations" not in flags:  # one is traced in a third of the time of three
+            if (
+                isinstance(job.training.model, CMIGNetFlags) and "model.matching.iterations" not in flags
+            ):  # one is traced in a third of the time of three
                 once = {"model.matching.iterations": 1}
                 job = replace(job, training=with_flags(job.training, once), test=with_flags(job.test, once))
             named = {flag: value for flag, value in flags.items() if not flag.startswith(COMPUTED_ALIKE)}
@@ -44,7 +48,7 @@ def described(config):
 
 
 def test_all_presets_and_heads_are_among_them():
-    assert {name.split("+")[0] for name in TRAININGS} == {"paper", "released", "corrected"}
+    assert {name.split("+")[0] for name in TRAININGS} == {"paper", "released", "corrected", *METHODS.values()}
     assert any("pcrnet" in name for name in TRAININGS)
     assert len(TESTS) > len(TRAININGS) > 20
 
@@ -62,7 +66,11 @@ def test_a_row_trains(name):
 def test_a_row_predicts(name):
     job = TESTS[name]
     *_, state, _ = described(job.training)
-    shown = with_flags(job.test, {"model.keypoints.test_count": 0})  # the smallest batch has no more points than that
+    network = job.test.model
+    # The smallest batch has no more points than keypoints in training.
+    shown = with_flags(job.test, {"model.keypoints.test_count": 0}) if isinstance(network, CMIGNetFlags) else job.test
     batch = jax.eval_shape(lambda: smallest_batch(shown.model.needs)).replace(target_from_source=None)
     predicted = jax.eval_shape(lambda v, b: predict(build(shown), v, b), state.variables, batch)
-    assert len(predicted.iterations) == job.test.model.matching.iterations + job.test.model.matching.repeats
+    assert predicted.target_from_source.R.shape == (1, 3, 3)
+    if isinstance(network, CMIGNetFlags):
+        assert len(predicted.iterations) == network.matching.iterations + network.matching.repeats

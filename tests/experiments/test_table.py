@@ -48,7 +48,7 @@ def test_a_row_that_failed_is_shown_so_and_has_no_figures(results):
     rows = cells(table(TABLE7, results, "markdown"))
     assert rows["n = 4"][0] == "0, 2 failed"
     assert set(rows["n = 4"][1:-4]) == {"–"}
-    assert notes(results)[:2] == ["n = 3, seed 1: not run", "n = 4, seed 0: failed: no such file"]
+    assert notes(TABLE7, results)[:2] == ["n = 3, seed 1: not run", "n = 4, seed 0: failed: no such file"]
 
 
 def test_every_style_has_every_row(results):

@@ -71,3 +71,27 @@ def test_the_derivative_of_equal_neighbours_goes_to_the_nearest():
 def test_neighbour_maximum_keeps_the_type(kernels):
     x, index = jnp.ones((1, 3, 2), jnp.bfloat16), np.zeros((1, 3, 2), np.int32)
     assert jax.eval_shape(lambda x: neighbour_maximum(x, index, kernels), x).dtype == jnp.bfloat16
+
+
+@pytest.mark.parametrize("rows", [0, 13])
+@pytest.mark.parametrize("kernels", ["plain", "fast"])
+@pytest.mark.parametrize("by", ["index", "nearest"])
+@pytest.mark.parametrize(("k", "radius"), [(5, 0.5), (70, 0.8)])
+def test_neighbours_within_a_radius_equal_brute_force(by, k, radius, kernels, rows):
+    points = clouds()
+    square = brute(points, points)
+    expected = np.empty((2, 60, k), int)
+    for b, i in np.ndindex(2, 60):
+        inside = [j for j in range(60) if j != i and square[b, i, j] <= radius**2]
+        ordered = sorted(inside, key=lambda j: j if by == "index" else square[b, i, j])[:k]
+        expected[b, i] = ordered + [i] * (k - len(ordered))
+    compute = ComputeConfig(kernels=kernels, rows=rows)
+    found = jax.jit(lambda x: neighbours.within_radius(x, radius, k, by, compute))(points)
+    np.testing.assert_array_equal(found, expected)
+    assert np.any(expected[..., -1] == np.arange(60))  # a neighbourhood that is not full
+
+
+def test_a_copy_of_a_point_is_its_neighbour_and_the_radius_counts():
+    points = np.array([[0, 0, 0], [0, 0, 0], [1, 0, 0]], np.float32)
+    found = neighbours.within_radius(points, 1.0, 2, "index", ComputeConfig())
+    np.testing.assert_array_equal(found, [[1, 2], [0, 2], [0, 1]])

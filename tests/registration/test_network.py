@@ -5,8 +5,12 @@ import dataclasses
 import jax
 import numpy as np
 import pytest
+from scipy.spatial import KDTree
 from scipy.spatial.transform import Rotation
 
+from cmig_jax.config import Needs
+from cmig_jax.data.normals import observed_normals
+from cmig_jax.data.sample import normalise_pair
 from cmig_jax.inference.load import Network
 from cmig_jax.inference.predictor import Predictor
 from cmig_jax.models.base import initial_variables
@@ -70,6 +74,33 @@ def test_more_points_than_the_network_knows_are_thinned_to_its_number(network, c
     register(source, target, network, refine=False)
     register(source[:20], target, network, refine=False)
     assert sizes == [(36, 36), (20, 36)], "36 of 48 points are left after the crop of its training"
+
+
+def test_a_network_that_was_trained_with_a_crop_of_the_source_gets_all_points_of_the_target(network, clouds_of_two_sizes, monkeypatch):
+    config = dataclasses.replace(network.config, data=dataclasses.replace(network.config.data, crop="source"))
+    sizes = []
+    monkeypatch.setattr(
+        Network, "__call__", lambda self, pairs: sizes.append([len(pairs[0][c]) for c in ("source", "target")]) or still(self, pairs)
+    )
+    register(*clouds_of_two_sizes, dataclasses.replace(network, config=config), refine=False)
+    assert sizes == [[36, 48]]
+
+
+def test_normals_are_estimated_before_the_clouds_are_thinned_where_the_network_reads_them(network, clouds_of_two_sizes, monkeypatch):
+    given = []
+    monkeypatch.setattr(Network, "__call__", lambda self, pairs: given.append(pairs[0]) or still(self, pairs))
+    register(*clouds_of_two_sizes, network, refine=False)
+    monkeypatch.setattr(type(network.config.model), "needs", Needs(points=16, normals=True))
+    register(*clouds_of_two_sizes, network, refine=False)
+    without, pair = given
+    assert not {"source_normals", "target_normals"} & set(without)
+    normalised = normalise_pair(*clouds_of_two_sizes)
+    for cloud in ("source", "target"):
+        np.testing.assert_array_equal(pair[cloud], without[cloud])
+        whole = getattr(normalised, cloud)
+        at = KDTree(whole).query(pair[cloud])[1]
+        assert len(at) < len(whole)
+        np.testing.assert_allclose(pair[f"{cloud}_normals"], observed_normals(whole)[at], atol=1e-4)
 
 
 def test_a_network_that_tests_with_all_points_takes_fewer_than_it_was_trained_with(network, clouds_of_two_sizes):

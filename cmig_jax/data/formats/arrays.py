@@ -15,6 +15,7 @@ from cmig_jax.data.formats.content import (
     coordinate_type,
     moved_columns,
     moved_points,
+    normals_of,
     stacked,
     turned,
 )
@@ -37,6 +38,13 @@ class Array:
         if names is None:
             raise ValueError(f"fields {', '.join(columns)}; expected x, y and z among them")
         return stacked(columns, names)
+
+    def normals(self) -> np.ndarray | None:
+        """Return the fields of normals, or unit vectors behind x y z, `[P, 3]` float64; else None."""
+        if self.values.dtype.names is not None:
+            return normals_of(self._columns())
+        behind = self.values[..., 3:6].reshape(-1, 3).astype(np.float64) if self.values.shape[-1] >= 6 else None
+        return behind if behind is not None and are_normals(behind) else None
 
     def moved(self, target_from_source: np.ndarray, suffix: str) -> bytes:
         """Encode as NPY; normals of a structured array, or unit vectors behind x y z, are turned."""
@@ -73,6 +81,14 @@ class Archive:
     name: str
     array: Array
 
+    def normals(self) -> np.ndarray | None:
+        """Return those of the array `normals` `[P, 3]` float64, or of the points' array; else None."""
+        if _NORMALS in self.members and self.name != _NORMALS:
+            normals = _load(self.members[_NORMALS])
+            if normals.shape == self.array.points().shape and normals.dtype.kind == "f":
+                return normals.astype(np.float64)
+        return self.array.normals()
+
     def moved(self, target_from_source: np.ndarray, suffix: str) -> bytes:
         """Encode as NPZ: points moved, an array `normals` turned, other members as they were."""
         members = {**self.members, self.name: self.array.moved(target_from_source, ".npy")}
@@ -86,7 +102,7 @@ class Archive:
 def read_npy(content: bytes, suffix: str) -> Parsed:
     """Read an NPY file (`Format.read`)."""
     array = Array(_checked(_load(content)))
-    return Parsed(array.points(), None, array)
+    return Parsed(array.points(), None, array, normals=array.normals)
 
 
 def read_npz(content: bytes, suffix: str) -> Parsed:
@@ -100,7 +116,8 @@ def read_npz(content: bytes, suffix: str) -> Parsed:
         names = ", ".join(name.removesuffix(".npy") for name in arrays) or "none"
         raise ValueError(f"arrays: {names}; expected one array, or one called points or xyz")
     array = Array(_checked(_load(members[named[0]])))
-    return Parsed(array.points(), None, Archive(members, named[0], array))
+    parsed = Archive(members, named[0], array)
+    return Parsed(array.points(), None, parsed, normals=parsed.normals)
 
 
 def encode_npy(points: np.ndarray, faces: np.ndarray | None, suffix: str) -> bytes:

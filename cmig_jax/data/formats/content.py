@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from typing import Protocol
 
@@ -24,6 +24,11 @@ class Content(Protocol):
         ...
 
 
+def without_normals() -> np.ndarray | None:
+    """Return None: the format has no normals of points, or they are not read."""
+    return None
+
+
 @dataclass(frozen=True)
 class Parsed:
     """A file as it was read.
@@ -33,12 +38,14 @@ class Parsed:
         faces: `[F, 3]` int64 indices into `points`; None for a cloud.
         content: all of the file.
         unit: name of the unit where the file says it.
+        normals: function that reads the normals `[P, 3]` of the rows, in any length; it returns None for a file without them.
     """
 
     points: np.ndarray
     faces: np.ndarray | None
     content: Content
     unit: str | None = None
+    normals: Callable[[], np.ndarray | None] = without_normals
 
 
 @dataclass(frozen=True)
@@ -119,7 +126,13 @@ def moved_columns(columns: dict[str, np.ndarray], target_from_source: np.ndarray
     return result
 
 
-def stacked(columns: dict[str, np.ndarray], names: tuple[str, str, str]) -> np.ndarray:
+def normals_of(columns: Mapping[str, np.ndarray]) -> np.ndarray | None:
+    """Return the columns of normals `[P, 3]` float64 of a table, or None."""
+    names = normal_axes([name for name, column in columns.items() if column.ndim == 1])
+    return None if names is None else stacked(columns, names)
+
+
+def stacked(columns: Mapping[str, np.ndarray], names: tuple[str, str, str]) -> np.ndarray:
     """Return three columns as `[P, 3]` float64."""
     return np.stack([np.asarray(columns[name], np.float64) for name in names], axis=-1)
 

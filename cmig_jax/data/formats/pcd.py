@@ -7,10 +7,11 @@ from __future__ import annotations
 
 import struct
 from dataclasses import dataclass
+from functools import partial
 
 import numpy as np
 
-from cmig_jax.data.formats.content import Parsed, axes, coordinate_type, moved_columns, stacked
+from cmig_jax.data.formats.content import Parsed, axes, coordinate_type, moved_columns, normals_of, stacked
 
 _KINDS = {"F": "f", "U": "u", "I": "i"}
 _LETTERS = {kind: letter for letter, kind in _KINDS.items()}
@@ -66,7 +67,7 @@ def read_pcd(content: bytes, suffix: str) -> Parsed:
     names = axes([name for name, column in columns.items() if column.ndim == 1])
     if names is None:
         raise ValueError(f"fields {' '.join(header.names)}; expected x y z among them")
-    return Parsed(stacked(columns, names), None, Pcd(header, columns))
+    return Parsed(stacked(columns, names), None, Pcd(header, columns), normals=partial(normals_of, columns))
 
 
 def encode_pcd(points: np.ndarray, faces: np.ndarray | None, suffix: str) -> bytes:

@@ -7,12 +7,13 @@ from __future__ import annotations
 
 import re
 from dataclasses import dataclass, replace
+from functools import partial
 
 import numpy as np
 from trimesh.geometry import triangulate_quads
 from trimesh.util import triangle_strips_to_faces
 
-from cmig_jax.data.formats.content import Parsed, axes, coordinate_type, moved_columns, stacked
+from cmig_jax.data.formats.content import Parsed, axes, coordinate_type, moved_columns, normals_of, stacked
 from cmig_jax.data.formats.ply_elements import Column, Element, Property, decode, encode
 
 _NAMES = {"i1": "char", "u1": "uchar", "i2": "short", "u2": "ushort", "i4": "int", "u4": "uint", "f4": "float", "f8": "double"}
@@ -140,7 +141,7 @@ def _parsed(content: Ply) -> Parsed:
     if faces is None and len(strips):
         pieces = [np.split(strip, np.flatnonzero(strip < 0)) for strip in strips]  # -1 begins another strip
         faces = triangle_strips_to_faces([piece[piece >= 0] for strip in pieces for piece in strip if (piece >= 0).sum() > 2])
-    return Parsed(stacked(vertex, names), faces, content)
+    return Parsed(stacked(vertex, names), faces, content, normals=partial(normals_of, vertex))
 
 
 def _moved(element: Element, columns: dict[str, Column], matrix: np.ndarray) -> tuple[Element, dict[str, Column]]:

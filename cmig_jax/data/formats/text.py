@@ -51,6 +51,11 @@ class Text:
         lines = self._lines(numbers, columns, suffix)
         return (self.line_end.join(lines) + self.line_end).encode(self.encoding)
 
+    def normals(self) -> np.ndarray | None:
+        """Return the normals of the points `[P, 3]`, or None."""
+        columns = self._normals()
+        return None if columns is None else _numbers(self.text, self.layout, columns)
+
     def _normals(self) -> tuple[int, int, int] | None:
         """Return the columns of normals: by name, or without a header those behind x y z if all have the length 1."""
         layout = self.layout
@@ -91,7 +96,8 @@ def read_text(content: bytes, suffix: str) -> Parsed:
     points = _numbers(text, layout, layout.xyz)
     if layout.count is not None and len(points) < layout.count:
         raise ValueError(f"{len(points)} lines of points; expected {layout.count}, as a line before them says")
-    return Parsed(points, None, Text(text, layout, points, suffix, encoding, line_end))
+    parsed = Text(text, layout, points, suffix, encoding, line_end)
+    return Parsed(points, None, parsed, normals=parsed.normals)
 
 
 def encode_text(points: np.ndarray, faces: np.ndarray | None, suffix: str) -> bytes:

@@ -10,7 +10,7 @@ import functools
 from pathlib import Path
 
 from cmig_jax.config import DataConfig
-from cmig_jax.data.geometry_files import SUFFIXES, geometry_files, read_object
+from cmig_jax.data.geometry_files import SUFFIXES, geometry_files, read_object_and_normals
 from cmig_jax.data.raw import RawDataset, RawObject, Source, Split, existing_folder, visible_files
 
 _TEST_SHARE = 0.2
@@ -50,7 +50,7 @@ def _category(folder: Path, label: int) -> list[RawObject]:
         held = max(1, round(_TEST_SHARE * len(files)))
         splits = {"train": files[:-held], "test": files[-held:]}
     return [
-        RawObject(path.relative_to(folder.parent).as_posix(), label, split, functools.partial(read_object, path))
+        RawObject(path.relative_to(folder.parent).as_posix(), label, split, functools.partial(read_object_and_normals, path))
         for split, files in splits.items()
         for path in files
     ]

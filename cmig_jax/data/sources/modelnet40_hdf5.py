@@ -1,5 +1,7 @@
 """ModelNet40 as HDF5 (Sec. IV-B): `ply_data_{train,test}*.h5` with `data` `[n, 2048, 3]` and `label` `[n, 1]`, and `shape_names.txt`.
 
+The normals of the points are read where a file has them (`normal` `[n, 2048, 3]`, as the release does).
+
 Download: `modelnet40_ply_hdf5_2048`, the release of PointNet's authors; the unpacked folder is the root (`docs/data.md`). The points of an
 object are centred, scaled to the unit sphere and in random order.
 """
@@ -15,7 +17,7 @@ import h5py
 import numpy as np
 
 from cmig_jax.config import DataConfig
-from cmig_jax.data.raw import RawDataset, RawObject, Source, Split, existing_folder
+from cmig_jax.data.raw import CloudWithNormals, RawDataset, RawObject, Source, Split, existing_folder
 
 
 def open_hdf5(data: DataConfig) -> RawDataset:
@@ -87,18 +89,20 @@ def _names(path: Path, count: int) -> list[str]:
     return names
 
 
-def _read_cloud(path: Path, row: int) -> np.ndarray:
+def _read_cloud(path: Path, row: int) -> np.ndarray | CloudWithNormals:
     try:
-        return _data(path, path.stat().st_mtime_ns)[row].astype(np.float32)
+        points, normals = _data(path, path.stat().st_mtime_ns)
+        cloud = points[row].astype(np.float32)
+        return cloud if normals is None else CloudWithNormals(cloud, normals[row])
     except (OSError, KeyError, IndexError) as error:
         raise ValueError(f"{path}: row {row} of `data` cannot be read ({error}); expected an intact HDF5 file") from error
 
 
-# Objects are read in order, and a file is compressed in chunks of many objects, so the last file is kept in memory (50 MB at most).
+# Objects are read in order, and a file is compressed in chunks of many objects, so the last file is kept in memory (100 MB at most).
 @functools.lru_cache(maxsize=1)
-def _data(path: Path, modified_ns: int) -> np.ndarray:
+def _data(path: Path, modified_ns: int) -> tuple[np.ndarray, np.ndarray | None]:
     with h5py.File(path) as file:
-        return np.asarray(file["data"])
+        return np.asarray(file["data"]), np.asarray(file["normal"]) if "normal" in file else None
 
 
 SOURCE = Source("modelnet40-hdf5", open_hdf5)

@@ -16,8 +16,8 @@ import trimesh
 from PIL import Image
 
 from cmig_jax.config import DataConfig
-from cmig_jax.data.geometry_files import read_object
-from cmig_jax.data.raw import RawDataset, RawObject, RecordedDataset, Recording, Source, existing_folder, visible_files
+from cmig_jax.data.geometry_files import read_object_and_normals
+from cmig_jax.data.raw import CloudWithNormals, RawDataset, RawObject, RecordedDataset, Recording, Source, existing_folder, visible_files
 
 FRAMES_PER_FRAGMENT = 50
 CELL = 0.01
@@ -37,8 +37,8 @@ class _Fragment:
     intrinsics: np.ndarray
     file: Path | None = None
 
-    def read(self) -> trimesh.Trimesh | np.ndarray:
-        return self.fuse() if self.file is None else read_object(self.file)
+    def read(self) -> trimesh.Trimesh | np.ndarray | CloudWithNormals:
+        return self.fuse() if self.file is None else read_object_and_normals(self.file)
 
     def fuse(self) -> np.ndarray:
         return fuse_frames(self.frames, self.intrinsics)

@@ -12,11 +12,10 @@ import itertools
 from pathlib import Path
 
 import numpy as np
-import trimesh
 from scipy.spatial.transform import Rotation
 
 from cmig_jax.config import DataConfig
-from cmig_jax.data.geometry_files import read_object
+from cmig_jax.data.geometry_files import read_geometry, read_object_and_normals
 from cmig_jax.data.raw import RawDataset, RawObject, RecordedDataset, Recording, Source, existing_folder, visible_files
 
 _CELL = 1 / 400  # share of the extent of fused scans; one point per cell is kept, so that regions in many scans are not denser
@@ -40,7 +39,9 @@ def open_models(data: DataConfig) -> RawDataset:
             objects.append(RawObject(name if len(here) == 1 else f"{name}/{conf.stem}", 0, "test", functools.partial(_fused, conf)))
     scanned = {conf.parent for conf in confs}
     models = [path for path in visible_files(folder, "**/*.ply") if path.parent not in scanned]
-    objects += [RawObject(path.relative_to(folder).as_posix(), 0, "test", functools.partial(read_object, path)) for path in models]
+    objects += [
+        RawObject(path.relative_to(folder).as_posix(), 0, "test", functools.partial(read_object_and_normals, path)) for path in models
+    ]
     if not objects:
         raise ValueError(f"{folder}: no *.ply and no *.conf in it; expected PLY models, or range scans with their .conf")
     return RawDataset(("scan",), tuple(objects))
@@ -95,8 +96,7 @@ def _scan(conf: Path, number: int, words: list[str]) -> tuple[Path, np.ndarray]:
 
 
 def _read_scan(path: Path) -> np.ndarray:
-    geometry = read_object(path)
-    return np.asarray(geometry.vertices if isinstance(geometry, trimesh.Trimesh) else geometry, np.float32)
+    return read_geometry(path).points.astype(np.float32)
 
 
 def _fused(conf: Path) -> np.ndarray:

@@ -12,7 +12,7 @@ from jax import Array
 from cmig_jax.config import ComputeConfig
 from cmig_jax.geometry.distances import squared_distances
 from cmig_jax.models.cmignet.flags import CMIGNetFlags, LossFlags
-from cmig_jax.models.cmignet.prediction import CMIGNetPrediction, Iteration
+from cmig_jax.models.cmignet.prediction import CMIGNetPrediction, Iteration, MatchingPrediction
 from cmig_jax.ops.chunks import chunk_length, split
 from cmig_jax.ops.neighbours import nearest
 from cmig_jax.ops.pooling import maximum
@@ -110,7 +110,7 @@ def overlap(
     return jnp.sum(total[:, 0] / jnp.maximum(total[:, 1], 1))
 
 
-def mask(prediction: CMIGNetPrediction) -> Array:
+def mask(prediction: MatchingPrediction) -> Array:
     """Regress the scores on the negative entropy of the first matching: rows for the source, columns for the target (Sec. III-F, L_MP)."""
     match, chosen = _present(prediction.iterations[0].match), prediction.keypoints
     sides = ((_present(prediction.source_scores), chosen.source_index, -1), (_present(prediction.target_scores), chosen.target_index, -2))
@@ -122,7 +122,7 @@ def mask(prediction: CMIGNetPrediction) -> Array:
     return total
 
 
-def matching(prediction: CMIGNetPrediction, iteration: Iteration, flags: LossFlags) -> Array:
+def matching(prediction: MatchingPrediction, iteration: Iteration, flags: LossFlags) -> Array:
     """Return the negative log-likelihood of the true correspondents under the matching matrix (L_CS)."""
     index, label = _present(prediction.keypoints.match_index), _present(prediction.keypoints.match_label)
     log_p = jax.nn.log_softmax(_present(iteration.match), axis=-1)
@@ -131,7 +131,7 @@ def matching(prediction: CMIGNetPrediction, iteration: Iteration, flags: LossFla
     return -jnp.sum(label * chosen) / count
 
 
-def credibility(prediction: CMIGNetPrediction, iteration: Iteration, source: Array, pose: RigidTransform, flags: LossFlags) -> Array:
+def credibility(prediction: MatchingPrediction, iteration: Iteration, source: Array, pose: RigidTransform, flags: LossFlags) -> Array:
     """Return the binary cross entropy of the matching scores (L_MS).
 
     Args:

@@ -54,24 +54,33 @@ class Iteration:
 
 
 @struct.dataclass(kw_only=True)
-class CMIGNetPrediction(Prediction):
+class MatchingPrediction(Prediction):
+    """What networks return that match keypoints in several rounds; the losses of matching read this.
+
+    Attributes:
+        keypoints: the selected points.
+        iterations: n rounds of correspondence search.
+        source_scores, target_scores: `[B, N]`, `[B, M]` significance of each cloud's points, or None where none is predicted.
+    """
+
+    keypoints: Keypoints
+    iterations: tuple[Iteration, ...]
+    source_scores: Array | None = None
+    target_scores: Array | None = None
+
+
+@struct.dataclass(kw_only=True)
+class CMIGNetPrediction(MatchingPrediction):
     """What the network returns; the losses read this, never parameters.
 
     Attributes:
         source_features, target_features: `[B, N, C]`, `[B, M, C]` of the point encoder, before fusion (F_X, F_Y).
         image_features: `[B, S, C]` maximum over views (F_I), or None.
         source_fused, target_fused: `[B, N, C]`, `[B, M, C]` hybrid features after fusion (F'_X, F'_Y).
-        source_scores, target_scores: `[B, N]`, `[B, M]` significance of each cloud's points, or None where none is predicted.
-        keypoints: the selected points.
-        iterations: n rounds of correspondence search.
     """
 
     source_features: Array
     target_features: Array
     source_fused: Array
     target_fused: Array
-    keypoints: Keypoints
-    iterations: tuple[Iteration, ...]
     image_features: Array | None = None
-    source_scores: Array | None = None
-    target_scores: Array | None = None

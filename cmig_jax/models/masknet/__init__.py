@@ -1,0 +1,1 @@
+"""MaskNet: the network, its flags and its losses."""

@@ -1,0 +1,1 @@
+"""PCRNet: the network, its flags and its losses."""

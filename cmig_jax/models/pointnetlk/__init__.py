@@ -1,0 +1,1 @@
+"""PointNetLK and PointNetLK Revisited: the network, its flags and its losses."""

@@ -35,6 +35,9 @@ METHODS = {
 }
 """The preset of each method, by its name in a table."""
 
+FLAGS: dict[str, Flags] = {"MaskNet, then ICP": {"model.share": 0.75}}
+"""What a method changes in these tables: there both clouds have the same number of points, of which MaskNet would leave out none."""
+
 QUOTED: dict[str, dict[str, Quoted]] = {
     "table1": {
         "PointNetLK": Quoted(16.788, 7.552, 0.0429, 0.0289),
@@ -91,7 +94,8 @@ def compared(table: str = "", flags: Flags | None = None, suffix: str = "") -> t
         suffix: of the labels.
     """
     quoted = QUOTED.get(table, {})
-    rows = tuple(Row(label + suffix, preset, flags or {}, quoted=quoted.get(label)) for label, preset in METHODS.items())
+    changes = {label: {**(flags or {}), **FLAGS.get(label, {})} for label in METHODS}
+    rows = tuple(Row(label + suffix, preset, changes[label], quoted=quoted.get(label)) for label, preset in METHODS.items())
     if not quoted:
         return rows
     return (*rows, Row("VRNet", None, quoted=quoted.get("VRNet"), absent="no public code"))

@@ -16,7 +16,7 @@ from cmig_jax.models.idam.flags import IDAMFlags
 from cmig_jax.models.masknet.flags import MaskNetFlags
 from cmig_jax.models.omnet.flags import OMNetFlags
 from cmig_jax.models.pcrnet.flags import PCRNetFlags
-from cmig_jax.models.pointnetlk.flags import PointNetLKFlags
+from cmig_jax.models.pointnetlk.flags import PointNetLKFlags, revisited
 from cmig_jax.models.prnet.flags import PRNetFlags
 from cmig_jax.models.rpmnet.flags import RPMNetFlags
 
@@ -34,16 +34,8 @@ def pointnetlk() -> Config:
 
 def pointnetlk_revisited() -> Config:
     """PointNetLK Revisited (Li et al., CVPR 2021): analytic Jacobian, a smaller encoder, 100 points at a time in training."""
-    model = PointNetLKFlags(
-        widths=(64, 128, 1024),
-        jacobian="analytic",
-        learn_jacobian=False,
-        test_iterations=20,
-        training_points=100,
-        residual_loss="change",
-    )
     optim = OptimConfig(learning_rate=1e-3, weight_decay=1e-4, milestones=(), epochs=200, batch=32)
-    return Config(name="pointnetlk-revisited", data=replace(TWISTS, points=1000), model=model, optim=optim)
+    return Config(name="pointnetlk-revisited", data=replace(TWISTS, points=1000), model=revisited(), optim=optim)
 
 
 def dcp() -> Config:

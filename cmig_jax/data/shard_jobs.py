@@ -10,11 +10,13 @@ import os
 import pickle
 import shutil
 import signal
+import tempfile
 import threading
 import zlib
 from collections.abc import Callable, Iterator
 from concurrent.futures.process import BrokenProcessPool
 from dataclasses import dataclass
+from multiprocessing.context import SpawnContext
 from pathlib import Path
 from typing import Any
 
@@ -73,7 +75,7 @@ def run_in_workers(jobs: list[Job], raw: RawDataset, workers: int, bar: tqdm) ->
     _check_picklable(raw)
     context = multiprocessing.get_context("spawn")
     stop = context.Event()
-    with concurrent.futures.ProcessPoolExecutor(workers, context, _start_worker, (raw, stop)) as pool:
+    with tempfile.TemporaryDirectory() as folder, _pool(workers, context, raw, Path(folder), stop) as pool:
         try:
             with _interrupts_blocked():
                 futures = [pool.submit(_make_in_worker, job) for job in jobs]
@@ -88,6 +90,16 @@ def run_in_workers(jobs: list[Job], raw: RawDataset, workers: int, bar: tqdm) ->
         finally:
             stop.set()
             pool.shutdown(cancel_futures=True)
+
+
+def _pool(workers: int, context: SpawnContext, raw: RawDataset, folder: Path, stop: Any) -> concurrent.futures.ProcessPoolExecutor:
+    """Make the pool; its processes read the objects from a file.
+
+    As an argument of theirs, more than a pipe holds would block this process for ever if one of them ends while it starts.
+    """
+    path = folder / "objects.pickle"
+    path.write_bytes(pickle.dumps(raw))
+    return concurrent.futures.ProcessPoolExecutor(workers, context, _start_worker, (path, stop))
 
 
 @contextlib.contextmanager
@@ -116,9 +128,9 @@ def _check_picklable(raw: RawDataset) -> None:
 _worker: dict[str, Any] = {}
 
 
-def _start_worker(raw: RawDataset, stop: Any) -> None:
+def _start_worker(objects: Path, stop: Any) -> None:
     threading.Thread(target=_end_with_the_parent, daemon=True).start()
-    _worker.update(raw=raw, stop=stop)
+    _worker.update(raw=pickle.loads(objects.read_bytes()), stop=stop)
 
 
 def _end_with_the_parent() -> None:

@@ -177,6 +177,17 @@ def test_a_script_that_its_workers_import_fails_with_an_explanation(meshes, tmp_
     assert "if __name__ == '__main__':" in run.stderr
 
 
+def test_so_does_one_from_the_standard_input_with_many_objects(tmp_path):
+    script = (
+        "from cmig_jax.config import DataConfig, ViewsConfig\n"
+        "from cmig_jax.data.prepare import prepare\n"
+        "prepare(DataConfig(source='shapes', shapes=100), ViewsConfig(of='both'), 'prepared', workers=2, progress=False)\n"
+    )
+    run = subprocess.run([sys.executable, "-"], input=script, cwd=tmp_path, capture_output=True, text=True, timeout=120, check=False)
+    assert run.returncode == 1
+    assert "OSError: a process that prepared prepared has ended early" in run.stderr
+
+
 @pytest.mark.parametrize(
     ("objects", "workers", "message"),
     [

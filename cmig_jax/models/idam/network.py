@@ -100,13 +100,15 @@ class IDAMNetwork(nn.Module):
         """Draw source keypoints, half of them with a correspondent; those of the target are their nearest points (Sec. 3.5)."""
         if batch.target_from_source is None or (key is None and source_index is None):
             raise ValueError("training draws keypoints with the true pose: expected batch.target_from_source, and a key or source_index")
-        correspondent, label = true_correspondents(
-            batch.source, batch.target, batch.target_from_source, self.flags.match_threshold, self.compute.rows
-        )
+        correspondent, label = self.correspondents(batch.source, batch.target, batch.target_from_source)
         if source_index is None:
             assert key is not None
             source_index = draw_for_training(key, label, count)
         return pair_in_order(source_index, correspondent, label)
+
+    def correspondents(self, source: Array, target: Array, pose: RigidTransform) -> tuple[Array, Array]:
+        """Return for each source point its nearest target point under the true pose, and 1 where the two correspond: `[B, N]` each."""
+        return true_correspondents(source, target, pose, self.flags.match_threshold, self.compute.rows)
 
     def iterate(self, source: KeypointSet, target: KeypointSet, train: bool) -> tuple[tuple[Iteration, ...], RigidTransform]:
         """Match, solve, move the source keypoints, n times (Sec. 3.2)."""

@@ -19,6 +19,7 @@ GEOMETRY = 8.0  # the four channels of distance and direction weigh more in the 
 STAGES = {
     "GraphLayer.__call__": lambda i: [f"gnn{i % IDAMFlags.layers + 1}_{CLOUDS[i // IDAMFlags.layers]}"],
     "Significance.__call__": lambda i: [("score_src", "score_tgt")[i]],
+    "IDAMNetwork.correspondents": lambda _: ["tgt_nearest", "labels"],
     "Matcher.pairs": lambda i: [f"it{i}/pair_feature"],
     "Matcher.best": lambda i: [f"it{i}/weight_in"],
     "Matcher.__call__": lambda i: [f"it{i}/match_raw", f"it{i}/logit"],
@@ -106,7 +107,7 @@ def _results(outcome: Outcome) -> Arrays:
     found |= {"src_idx": chosen.source_index, "tgt_idx": chosen.target_index, "R": pose.R, "t": pose.t}
     found |= {"K": np.asarray(chosen.source_index.shape[1])}
     if chosen.match_label is not None:
-        found |= {"match_labels": chosen.match_label, "tgt_nearest": _nearest(outcome.inputs)}
+        found["match_labels"] = chosen.match_label
     found |= {f"it0/negent_{cloud}": _negative_entropy(prediction.iterations[0].match, axis) for cloud, axis in (("src", -1), ("tgt", -2))}
     return found | {f"loss_terms/{name}": np.asarray(value) for name, value in outcome.terms.items()}
 
@@ -121,12 +122,6 @@ def _iteration(name: str, iteration: Iteration) -> Arrays:
         "t": iteration.step.t,
     }
     return {f"{name}/{key}": np.asarray(value) for key, value in values.items()}
-
-
-def _nearest(inputs: Arrays) -> np.ndarray:
-    """Return for all source points the nearest target point under the true pose, of which the network returns the keypoints' alone."""
-    moved = np.einsum("bij,bjn->bni", inputs["R_gt"], inputs["src"]) + inputs["t_gt"][:, None]
-    return np.linalg.norm(moved[:, :, None] - channels_second(inputs["tgt"])[:, None], axis=-1).argmin(axis=-1)
 
 
 def _negative_entropy(match: np.ndarray, axis: int) -> np.ndarray:

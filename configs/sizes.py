@@ -83,7 +83,9 @@ TOY: dict[type[ModelFlags], Resize] = {
     CMIGNetFlags: _toy_cmignet,
     DCPFlags: lambda flags: replace(flags, k=4, widths=(4, 4), dim=8, heads=2, feed_forward=8),
     FINetFlags: lambda flags: replace(flags, encoder_widths=(4, 4, 4, 4, 4), fusion_widths=(8, 4), regression_widths=(8,)),
-    IDAMFlags: lambda flags: flags,
+    IDAMFlags: lambda flags: replace(
+        flags, k=4, layers=2, dim=8, significance_widths=(8,), pair_width=8, points_per_keypoint=3, iterations=2
+    ),
     MaskNetFlags: lambda flags: replace(flags, widths=(4, 8), mask_widths=(8, 4), icp_iterations=2),
     OMNetFlags: lambda flags: replace(
         flags, local_widths=(4,), global_widths=(4, 8), fusion_widths=(8,), decoder_widths=(4, 4, 4), regression_widths=(8,)

@@ -43,7 +43,7 @@ class RPMNetFlags(ModelFlags):
     def __post_init__(self) -> None:
         *narrow, last = self.parameter_widths or (0,)
         divisible = all(width >= GROUPS and width % GROUPS == 0 for width in narrow)
-        wide = all(width >= WIDE_GROUPS and width % WIDE_GROUPS == 0 for width in (last, *self.parameter_head))
+        wide, wide_head = (all(w >= WIDE_GROUPS and w % WIDE_GROUPS == 0 for w in widths) for widths in ((last,), self.parameter_head))
         check(
             [
                 (f"model.radius = {self.radius}", self.radius > 0, "above 0"),
@@ -54,7 +54,7 @@ class RPMNetFlags(ModelFlags):
                     divisible and wide,
                     f"multiples of {GROUPS}, the last one of {WIDE_GROUPS}",
                 ),
-                (f"model.parameter_head = {self.parameter_head}", wide, f"multiples of {WIDE_GROUPS}"),
+                (f"model.parameter_head = {self.parameter_head}", wide_head, f"multiples of {WIDE_GROUPS}"),
                 (f"model.iterations = {self.iterations}", self.iterations >= 1, "at least 1"),
                 (f"model.test_iterations = {self.test_iterations}", self.test_iterations >= 1, "at least 1"),
                 (f"model.sinkhorn_rounds = {self.sinkhorn_rounds}", self.sinkhorn_rounds >= 0, "0 or more"),

@@ -109,14 +109,12 @@ def _run_one(command: Run, catalogue: Catalogue, name: str) -> bool:
 
     experiment, jobs = catalogue.experiments[name], jobs_of(command, catalogue, name)
     print(f"{name}: {experiment.about}")
-    if command.only_collect:
-        results = collect(jobs, with_baselines=experiment.baselines)
-    else:
-        chosen = [job for job in jobs if not command.rows or job.row.label in command.rows]
-        ran = run_jobs(chosen, with_baselines=experiment.baselines and command.baselines)
-        found = collect(jobs, with_baselines=experiment.baselines)
-        outcomes = {id(outcome.job): outcome for outcome in (*found.outcomes, *ran.outcomes)}
-        results = Results(tuple(outcomes[id(job)] for job in jobs), ran.baselines or found.baselines)
+    chosen = [] if command.only_collect else [job for job in jobs if not command.rows or job.row.label in command.rows]
+    others = [job for job in jobs if job not in chosen]
+    ran = run_jobs(chosen, with_baselines=experiment.baselines and command.baselines)
+    found = collect(others, with_baselines=experiment.baselines)
+    outcomes = {id(outcome.job): outcome for outcome in (*ran.outcomes, *found.outcomes)}
+    results = Results(tuple(outcomes[id(job)] for job in jobs), ran.baselines or found.baselines)
     write(command.runs / command.scale, name, experiment, results)
     return any(outcome.problem.startswith("failed") for outcome in results.outcomes)
 

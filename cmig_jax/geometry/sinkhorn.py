@@ -21,10 +21,13 @@ def log_sinkhorn(affinity: Array, rounds: int) -> Array:
     Returns:
         Logarithms `[..., N, M]` of the matching, without the slack. After the last round the columns with their slack sum to 1.
     """
-    u, v = jnp.zeros_like(affinity[..., 0]), jnp.zeros_like(affinity[..., 0, :])
-    for _ in range(rounds):
-        u = _with_slack(affinity - v[..., None, :], axis=-1)
-        v = _with_slack(affinity - u[..., None], axis=-2)
+
+    def one_round(_: Array, slack: tuple[Array, Array]) -> tuple[Array, Array]:
+        u = _with_slack(affinity - slack[1][..., None, :], axis=-1)
+        return u, _with_slack(affinity - u[..., None], axis=-2)
+
+    start = jnp.zeros_like(affinity[..., 0]), jnp.zeros_like(affinity[..., 0, :])
+    u, v = jax.lax.fori_loop(0, rounds, one_round, start)
     return affinity - u[..., None] - v[..., None, :]
 
 

@@ -77,6 +77,7 @@ class InProcess:
         return self(f"memory {mode}")
 
 
+@pytest.mark.slow
 def test_a_worker_that_fails_is_named():
     with (
         Worker("tiny", "ours", "cpu", ComputeConfig(), allocator={}) as process,

@@ -5,7 +5,6 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from scipy.integrate import solve_ivp
-from scipy.linalg import logm
 from scipy.spatial.transform import Rotation
 
 from cmig_jax.config import DataConfig
@@ -122,9 +121,10 @@ def test_twists_have_a_uniform_direction_and_a_uniform_length(longest):
 
 
 def logarithm(R, t):
-    """Return the twist of a pose, from the matrix logarithm."""
-    found = logm(np.block([[R, t[:, None]], [np.zeros((1, 3)), 1]])).real
-    return np.array([found[2, 1], found[0, 2], found[1, 0], *found[:3, 3]])
+    """Return the twist (w, v) of a pose: t = V v, with V the mean of the rotations by s w for s in [0, 1]."""
+    w = Rotation.from_matrix(R).as_rotvec()
+    V = np.mean([Rotation.from_rotvec(s * w).as_matrix() for s in (np.arange(40) + 0.5) / 40], axis=0)
+    return np.concatenate([w, np.linalg.solve(V, t)])
 
 
 @pytest.mark.parametrize("seed", range(3))

@@ -139,6 +139,7 @@ def test_the_losses_are_zero_at_the_truth_and_the_consistent_cycle_at_inverse_po
     assert not any(name.startswith("cycle") for name in losses(found, batch, dataclasses.replace(flags, cycle="off"), ComputeConfig()))
 
 
+@pytest.mark.slow
 def test_training_lowers_the_loss_with_finite_gradients(random_variables):
     with jax.enable_x64(False):
         flags, batch = dataclasses.replace(TINY, iterations=1), pairs(16, 20, np.float32)

@@ -54,6 +54,7 @@ def assert_same(a, b, atol=1e-9):
     jax.tree.map(functools.partial(np.testing.assert_allclose, atol=atol), a, b)
 
 
+@pytest.mark.slow
 def test_it_iterates_more_in_evaluation_and_gives_rotations_and_scores(variables, x64):
     found = evaluate(NETWORK, variables, batch())
     assert len(found.iterations) == 5
@@ -127,6 +128,7 @@ def test_terms_are_discounted_and_vanish_for_the_true_pose(variables, x64):
     assert RPMNET.losses(prediction, right, FLAGS, ComputeConfig())["mae_1"] == 0
 
 
+@pytest.mark.slow
 def test_a_few_steps_of_adam_lower_the_loss(random_variables):
     given = jax.tree.map(jnp.float32, batch())
     params = random_variables(NETWORK, given, train=False, dtype=np.float32)["params"]

@@ -50,8 +50,7 @@ def test_values_and_derivatives_are_those_of_the_plain_layers(variables):
 
 def test_float32_keeps_its_digits_far_from_the_origin(variables):
     with jax.enable_x64(True):
-        exact = jax.jit(plain)(variables, cloud() + 100)
+        exact = np.asarray(jax.jit(plain)(variables, cloud() + 100))
     narrow = jax.tree.map(np.float32, variables)
-    error = [np.max(np.abs(jax.jit(f)(narrow, cloud(np.float32) + np.float32(100)) - exact)) for f in (folded, plain)]
-    assert error[0] < 1e-3
-    assert error[0] < 3 * error[1]
+    found = np.asarray(jax.jit(folded)(narrow, cloud(np.float32) + np.float32(100)))
+    assert np.max(np.abs(found - exact)) < 100 * np.finfo(np.float32).eps  # the rounding of the coordinates themselves

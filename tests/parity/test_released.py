@@ -13,7 +13,7 @@ from cmig_jax.parity.cmignet_run import INPUTS, TRAINING_INPUTS
 from .recording import GOLDEN, read_whole, write_case, write_released
 
 
-@pytest.mark.parametrize("kernels", ["plain", "fast"])
+@pytest.mark.parametrize("kernels", [pytest.param("plain", marks=pytest.mark.slow), "fast"])
 def test_the_network_computes_the_same(main, tmp_path, kernels):
     done = main("parity", "check", "--kernels", kernels, "--json", tmp_path / "rows.json")
     assert done.returncode == 0, done.stdout + done.stderr

@@ -15,12 +15,16 @@ from cmig_jax.models.networks import config_from_json, model_of
 from cmig_jax.structs import Batch, Prediction
 from cmig_jax.transform import RigidTransform
 from configs import PRESETS
+from configs.methods import METHODS
 from configs.scale import SCALES
 
 CORRECTED = ("corrected", "corrected-cpu", "quickstart", "own-clouds", "modelnet40-cpu")
 
 
-@pytest.fixture(params=PRESETS)
+SMALL_METHODS = {name for name in METHODS if name.endswith("-cpu")}  # `tests/experiments/test_rows.py` traces such networks too
+
+
+@pytest.fixture(params=[pytest.param(name, marks=pytest.mark.slow if name in SMALL_METHODS else ()) for name in PRESETS])
 def preset(request) -> Config:
     return PRESETS[request.param]()
 
@@ -88,13 +92,13 @@ def test_a_preset_describes_a_network_that_trains_and_predicts(preset):
 
 DATA = {"name", "data.source", "data.sampling", "data.crop", "data.keep", "data.pose", "data.turn", "data.noise_std", "views.of"}
 MODEL = ("fusion.points", "fusion.image", "keypoints.select", "matching.head", "matching.repeats", "pose.centroid", "loss.cross_modal")
-METHODS = ("iterations", "pointer", "matching", "jacobian", "residual_loss", "loss", "cycle", "sinkhorn_rounds", "unmasked", "share")
+METHOD = ("iterations", "pointer", "matching", "jacobian", "residual_loss", "loss", "cycle", "sinkhorn_rounds", "unmasked", "share")
 
 
 @pytest.mark.parametrize("scale", SCALES)
 def test_a_scale_keeps_what_is_computed_and_from_what_data(preset, scale):
     small = SCALES[scale](preset)
-    kept = DATA | {f"model.{flag}" for flag in (*MODEL, *(METHODS if scale == "cpu" else ()))}
+    kept = DATA | {f"model.{flag}" for flag in (*MODEL, *(METHOD if scale == "cpu" else ()))}
     assert not kept & {line.split(": ")[0] for line in differences(preset, small)}
     assert small == preset if scale == "full" else small == SCALES[scale](small)
     needs = small.model.needs

@@ -130,6 +130,7 @@ def test_the_losses_are_zero_at_the_truth_and_the_consistent_cycle_at_inverse_po
     assert set(losses(found, batch, TINY, ComputeConfig())) == {"rotation", "translation"}
 
 
+@pytest.mark.slow
 def test_training_lowers_the_loss_with_finite_gradients(random_variables):
     with jax.enable_x64(False):
         flags, batch = dataclasses.replace(TINY, cycle="official"), pairs(16, 20, np.float32)

@@ -202,6 +202,7 @@ def test_without_a_pair_in_reach_matching_costs_nothing_and_by_distance_no_partn
         np.testing.assert_allclose(terms[f"credibility_{i}"], np.mean(np.log1p(np.exp(np.asarray(iteration.logit)))))
 
 
+@pytest.mark.slow
 def test_plain_and_fast_agree(variables, x64):
     def both(network):
         return objective(network, variables["params"], variables, pairs(30, 30), key=jax.random.key(0))

@@ -113,6 +113,7 @@ def training(flags):
     return jax.jit(jax.value_and_grad(loss, has_aux=True))
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("kind", ["mse", "bce"])
 def test_a_few_steps_lower_the_loss_and_a_given_label_is_the_one_of_the_true_pose(kind):
     batch, params, statistics = clouds(B=3), variables()["params"], variables()["batch_stats"]

@@ -127,6 +127,7 @@ def unequal():
     return batch.replace(source=batch.source[:, :25])
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("flags", LEARNING)
 def test_a_few_steps_lower_the_loss_for_clouds_of_unequal_size(flags):
     params, adam, values = wide_variables(flags)["params"], optax.adam(2e-3), []

@@ -115,6 +115,7 @@ def test_gradients_are_finite_and_stay_within_their_iteration(case, x64):
     assert reached == {"stages_1"}
 
 
+@pytest.mark.slow
 def test_a_few_steps_lower_the_loss(case):
     model, flags, _, variables = case
     compute = ComputeConfig(precision="bfloat16") if model is OMNET else ComputeConfig(recompute=True)

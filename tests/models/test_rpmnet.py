@@ -110,6 +110,7 @@ def objective(network, params, given):
     return sum(RPMNET.losses(prediction, given, network.flags, network.compute).values())
 
 
+@pytest.mark.slow
 def test_derivatives_are_finite_for_copies_of_points_lonely_points_and_normals_of_0(variables):
     given = jax.tree.map(lambda x: np.array(x, np.float32), batch())
     given.source[:, 3], given.source[:, 5], given.source_normals[:, 7] = given.source[:, 4], 9.0, 0.0

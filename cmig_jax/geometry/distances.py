@@ -49,12 +49,12 @@ def chamfer_distance(a: Array, b: Array) -> Array:
     """
     square = squared_distances(*jax.lax.stop_gradient((a, b)))
     of_a, of_b = jnp.argmin(square, axis=-1)[..., None], jnp.argmin(square, axis=-2)[..., None]
-    there = _length(a - jnp.take_along_axis(b, of_a, axis=-2))
-    back = _length(b - jnp.take_along_axis(a, of_b, axis=-2))
+    there = length(a - jnp.take_along_axis(b, of_a, axis=-2))
+    back = length(b - jnp.take_along_axis(a, of_b, axis=-2))
     return (jnp.mean(there, axis=-1) + jnp.mean(back, axis=-1)) / 2
 
 
-def _length(x: Array) -> Array:
+def length(x: Array) -> Array:
+    """Return the Euclidean length of vectors `[..., C]`, with derivative 0 where it is 0."""
     square = jnp.sum(x**2, axis=-1)
-    zero = square == 0
-    return jnp.where(zero, 0, jnp.sqrt(jnp.where(zero, 1, square)))
+    return jnp.where(square == 0, 0, jnp.sqrt(jnp.where(square == 0, 1, square)))

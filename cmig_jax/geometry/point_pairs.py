@@ -6,6 +6,8 @@ import jax
 import jax.numpy as jnp
 from jax import Array
 
+from cmig_jax.geometry.distances import length
+
 HIGHEST = jax.lax.Precision.HIGHEST
 
 
@@ -29,9 +31,3 @@ def angle_between(a: Array, b: Array) -> Array:
     cross, dot = length(jnp.cross(a, b)), jnp.einsum("...c,...c->...", a, b, precision=HIGHEST)
     undefined = (cross == 0) & (dot == 0)
     return jnp.where(undefined, 0, jnp.arctan2(cross, jnp.where(undefined, 1, dot)))
-
-
-def length(x: Array) -> Array:
-    """Return the Euclidean length of vectors `[..., C]`, with derivative 0 where it is 0."""
-    square = jnp.sum(x**2, axis=-1)
-    return jnp.where(square == 0, 0, jnp.sqrt(jnp.where(square == 0, 1, square)))

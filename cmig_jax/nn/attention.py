@@ -11,7 +11,7 @@ import jax.numpy as jnp
 from jax import Array
 
 from cmig_jax.config import ComputeConfig
-from cmig_jax.nn.mlp import MLP, Dense
+from cmig_jax.nn.mlp import MLP, Dense, activate
 from cmig_jax.nn.norm import LayerNorm
 from cmig_jax.ops.attention import attend
 
@@ -78,8 +78,7 @@ class FeedForward(nn.Module):
     def __call__(self, x: Array) -> Array:
         """Map `x [..., C]` to `[..., dim]`."""
         x = Dense(self.hidden, compute=self.compute, name="layer_0")(x)
-        x = nn.leaky_relu(x, self.negative_slope) if self.negative_slope else nn.relu(x)
-        return Dense(self.dim, compute=self.compute, name="layer_1")(x)
+        return Dense(self.dim, compute=self.compute, name="layer_1")(activate(x, self.negative_slope))
 
 
 class Attention(nn.Module):

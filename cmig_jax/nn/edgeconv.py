@@ -17,7 +17,7 @@ import jax.numpy as jnp
 from jax import Array
 
 from cmig_jax.config import ComputeConfig
-from cmig_jax.nn.mlp import Dense, Weights, torch_kernel
+from cmig_jax.nn.mlp import Dense, Weights, activate, torch_kernel
 from cmig_jax.nn.norm import BatchNorm
 from cmig_jax.ops.chunks import chunk_length, join, split
 from cmig_jax.ops.edges import edge_moments, gather, neighbour_maximum
@@ -64,7 +64,7 @@ class PointEncoder(nn.Module):
         outputs = tuple(dense(jnp.concatenate(parts, axis=-1)) for parts in collected)
         batch = moments(outputs, self.compute.kernels) if train else None
         affine = BatchNorm(self.dim, self.compute, name="last_norm").affine(batch)
-        return tuple(_activate(affine(x), self.negative_slope).astype(cloud.dtype) for x, cloud in zip(outputs, clouds, strict=True))
+        return tuple(activate(affine(x), self.negative_slope).astype(cloud.dtype) for x, cloud in zip(outputs, clouds, strict=True))
 
 
 class EdgeConv(nn.Module):
@@ -98,7 +98,7 @@ class EdgeConv(nn.Module):
         outputs = []
         for p, q, index in zip(neighbour, centre, neighbours, strict=True):
             edge = neighbour_maximum(p, index, self.compute.kernels) + q
-            outputs.append(_activate(affine(edge), self.negative_slope).astype(clouds[0].dtype))
+            outputs.append(activate(affine(edge), self.negative_slope).astype(clouds[0].dtype))
         return tuple(outputs)
 
     def _project(self, x: Array, kernel: Array, sign: Array) -> tuple[Array, Array]:
@@ -169,10 +169,6 @@ class StaticEdgeEncoder(nn.Module):
             edges = nn.relu(normalise(i, edges)(edges))
             outputs.append(maximum(edges, 2, self.compute.kernels))
         return tuple(outputs)
-
-
-def _activate(x: Array, negative_slope: float) -> Array:
-    return nn.leaky_relu(x, negative_slope) if negative_slope else nn.relu(x)
 
 
 def _centred(parts: list[Array]) -> tuple[Clouds, Array]:

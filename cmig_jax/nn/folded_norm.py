@@ -15,6 +15,7 @@ from jax import Array
 from cmig_jax.config import ComputeConfig
 from cmig_jax.nn.mlp import Weights
 from cmig_jax.nn.norm import EPSILON
+from cmig_jax.ops.pooling import selected_maximum
 
 HIGHEST = jax.lax.Precision.HIGHEST
 
@@ -42,7 +43,7 @@ class FoldedMLP(nn.Module):
             dtype = self.compute.dtype or kernel.dtype
             product = jnp.einsum("bpc,bcd->bpd", hidden.astype(dtype), folded.astype(dtype))
             if i == len(self.widths) - 1:
-                return nn.relu(_neighbour_maximum(product.reshape(B, N, k, -1)) + offset[:, None].astype(dtype))
+                return nn.relu(selected_maximum(product.reshape(B, N, k, -1), 2) + offset[:, None].astype(dtype))
             hidden = nn.relu(product + offset[:, None].astype(dtype))
         return hidden
 
@@ -90,18 +91,3 @@ def _mean(x: Array) -> Array:
     """Return the mean `[B, C]` over the positions of `x [B, P, C]`, as a product: XLA's CPU compiler sums columns slowly."""
     wide = jnp.promote_types(x.dtype, jnp.float32)
     return jnp.einsum("p,bpc->bc", jnp.full(x.shape[1], 1 / x.shape[1], x.dtype), x, precision=HIGHEST, preferred_element_type=wide)
-
-
-@jax.custom_jvp
-def _neighbour_maximum(x: Array) -> Array:
-    """Return the maximum `[B, N, C]` over the neighbours of `x [B, N, k, C]`; its derivative goes to the first that has it."""
-    return jnp.max(x, axis=2)
-
-
-@_neighbour_maximum.defjvp
-def _neighbour_maximum_jvp(primals: tuple[Array], tangents: tuple[Array]) -> tuple[Array, Array]:
-    # A selection, not `take_along_axis`: its transpose would scatter one number per point and channel, one after another.
-    (x,), (tangent,) = primals, tangents
-    position = jnp.argmax(jax.lax.stop_gradient(x), axis=2, keepdims=True)
-    chosen = jnp.arange(x.shape[2]).reshape(1, 1, -1, 1) == position
-    return _neighbour_maximum(x), jnp.sum(jnp.where(chosen, tangent, 0), axis=2)

@@ -23,6 +23,11 @@ def torch_bias(fan_in: int) -> Callable[[Array, tuple[int, ...]], Array]:
     return lambda key, shape: jax.random.uniform(key, shape, minval=-bound, maxval=bound)
 
 
+def activate(x: Array, negative_slope: float) -> Array:
+    """Apply the leaky ReLU; ReLU for a slope of 0."""
+    return nn.leaky_relu(x, negative_slope) if negative_slope else nn.relu(x)
+
+
 class Dense(nn.Module):
     """A linear layer on the channels."""
 
@@ -88,7 +93,7 @@ class NormedMLP(nn.Module):
             elif self.norm == "group":
                 groups = self.groups if isinstance(self.groups, int) else self.groups[i]
                 x = GroupNorm(groups, name=f"norm_{i}")(x)
-            x = nn.leaky_relu(x, self.negative_slope) if self.negative_slope else nn.relu(x)
+            x = activate(x, self.negative_slope)
         return x
 
 

@@ -37,6 +37,23 @@ def _maximum_jvp(axis: int, primals: tuple[Array], tangents: tuple[Array]) -> tu
     return _maximum(x, axis), _at_argmax(x, tangent, axis)
 
 
+@functools.partial(jax.custom_jvp, nondiff_argnums=(1,))
+def selected_maximum(x: Array, axis: int) -> Array:
+    """Return `maximum(x, axis)`, faster to differentiate where `axis` is short.
+
+    Its derivative selects among all values. That of `maximum` scatters one number for each of the results, one after another.
+    """
+    return jnp.max(x, axis=axis)
+
+
+@selected_maximum.defjvp
+def _selected_maximum_jvp(axis: int, primals: tuple[Array], tangents: tuple[Array]) -> tuple[Array, Array]:
+    (x,), (tangent,) = primals, tangents
+    position = jnp.argmax(jax.lax.stop_gradient(x), axis=axis, keepdims=True)
+    chosen = jax.lax.broadcasted_iota(position.dtype, x.shape, axis) == position
+    return selected_maximum(x, axis), jnp.sum(jnp.where(chosen, tangent, 0), axis=axis)
+
+
 def max_pool(x: Array, kernels: Kernels = "auto") -> Array:
     """Return the maximum over windows of 3 x 3 around every second pixel: `[B, H, W, C]` to `[B, ceil(H / 2), ceil(W / 2), C]`.
 

@@ -3,8 +3,11 @@
 from __future__ import annotations
 
 import itertools
+import re
 from collections.abc import Iterator
+from typing import Literal
 
+from cmig_jax.parity.cases import State
 from cmig_jax.parity.weights import COUNTER, RUNNING, Tensor
 
 
@@ -47,3 +50,21 @@ def transformer(name: str, path: str, dim: int, hidden: int) -> Iterator[Tensor]
         for i, norm in enumerate([*(f"{layer}.sublayer.{i}.norm" for i in range(len(attentions) + 1)), f"{name}.{half}.norm"]):
             for leaf, other in (("a_2", "scale"), ("b_2", "bias")):
                 yield Tensor(f"{norm}.{leaf}", (dim,), ("params", *path.split("/"), f"{half}_norms_{i}", other))
+
+
+def pointnet_path(kind: Literal["layer", "norm"], i: int, widths: tuple[int, ...]) -> str:
+    """Return where layer i of the `PointNet` named `encoder` stands, or its normalisation."""
+    return f"encoder/layers/{kind}_{i}" if i + 1 < len(widths) else f"encoder/last{'' if kind == 'layer' else '_norm'}"
+
+
+def widths_of(state: State, name: str) -> tuple[int, ...]:
+    """Return the output channels of the layers `name`, with `{}` for their number.
+
+    Raises:
+        ValueError: there is none.
+    """
+    form = re.compile(re.escape(name).replace(r"\{\}", r"(\d+)") + r"\.weight")
+    found = {int(match[1]): len(state[key]) for key in state if (match := form.fullmatch(key))}
+    if not found:
+        raise ValueError(f"this state has no {name.format('*')}.weight")
+    return tuple(found[number] for number in sorted(found))

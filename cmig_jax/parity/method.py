@@ -24,6 +24,7 @@ from cmig_jax.parity.cases import Arrays, Case, State
 from cmig_jax.parity.rows import Row, compare_all
 from cmig_jax.parity.weights import COUNTER, Layout, by_torch_name, named_weights, to_flax
 from cmig_jax.structs import Batch, Prediction
+from cmig_jax.transform import RigidTransform
 
 Stages = Mapping[str, Callable[[int], Sequence[str]]]
 
@@ -166,3 +167,13 @@ def _wide(tree: Any) -> Any:
 def channels_second(value: NDArray) -> NDArray:
     """Swap points and channels, `[B, N, C]` to `[B, C, N]` or back."""
     return np.swapaxes(value, 1, 2)
+
+
+def pair_batch(inputs: Mapping[str, Any]) -> Batch:
+    """Return the clouds `src` and `tgt`, channels last, and the true pose of a case."""
+    return Batch(inputs["src"], inputs["tgt"], target_from_source=RigidTransform(inputs["R_gt"], inputs["t_gt"]))
+
+
+def pair_batch_channels_second(inputs: Mapping[str, Any]) -> Batch:
+    """Return the same of clouds whose channels come second."""
+    return pair_batch({**inputs, **{name: channels_second(inputs[name]) for name in ("src", "tgt")}})

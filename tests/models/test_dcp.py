@@ -14,8 +14,9 @@ from cmig_jax.models.base import initial_variables, predict
 from cmig_jax.models.dcp.network import DCP, DCPFlags, DCPNetwork, losses
 from cmig_jax.nn.edgeconv import StaticEdgeEncoder
 from cmig_jax.nn.pointer import pointed_pose
-from cmig_jax.structs import Batch
 from cmig_jax.transform import RigidTransform
+
+from .random_pairs import assert_same, pairs
 
 TINY = DCPFlags(k=4, widths=(6, 8), dim=8, heads=2, feed_forward=12)
 V1 = dataclasses.replace(TINY, pointer="identity")
@@ -27,16 +28,6 @@ evaluate = jax.jit(predict, static_argnums=0)
 def x64():
     with jax.enable_x64(True):
         yield
-
-
-def pairs(N=17, M=23, dtype=np.float64):
-    rng = np.random.default_rng(0)
-    truth = RigidTransform(R=Rotation.random(2, rng=rng).as_matrix().astype(dtype), t=rng.normal(size=(2, 3)).astype(dtype))
-    return Batch(rng.normal(size=(2, N, 3)).astype(dtype), rng.normal(size=(2, M, 3)).astype(dtype), target_from_source=truth)
-
-
-def assert_same(a, b, atol=1e-10):
-    jax.tree.map(lambda x, y: np.testing.assert_allclose(x, y, atol=atol), a, b)
 
 
 @VERSIONS

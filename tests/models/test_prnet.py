@@ -7,14 +7,13 @@ import jax.numpy as jnp
 import numpy as np
 import optax
 import pytest
-from scipy.spatial.transform import Rotation
 
 from cmig_jax.config import ComputeConfig, FlagError
 from cmig_jax.models.base import initial_variables, predict
 from cmig_jax.models.prnet.network import PRNET, PRNet, PRNetFlags, losses
 from cmig_jax.nn.edgeconv import EdgeConv
-from cmig_jax.structs import Batch
-from cmig_jax.transform import RigidTransform
+
+from .random_pairs import assert_same, pairs
 
 TINY = PRNetFlags(k=4, widths=(6, 8), dim=8, heads=2, feed_forward=12, keypoints=12, iterations=2)
 SOFT = dataclasses.replace(TINY, matching="softmax")
@@ -26,16 +25,6 @@ evaluate = jax.jit(predict, static_argnums=0)
 def x64():
     with jax.enable_x64(True):
         yield
-
-
-def pairs(N=17, M=23, dtype=np.float64):
-    rng = np.random.default_rng(0)
-    truth = RigidTransform(R=Rotation.random(2, rng=rng).as_matrix().astype(dtype), t=rng.normal(size=(2, 3)).astype(dtype))
-    return Batch(rng.normal(size=(2, N, 3)).astype(dtype), rng.normal(size=(2, M, 3)).astype(dtype), target_from_source=truth)
-
-
-def assert_same(a, b, atol=1e-9):
-    jax.tree.map(lambda x, y: np.testing.assert_allclose(x, y, atol=atol), a, b)
 
 
 @MATCHINGS

@@ -17,9 +17,10 @@ from cmig_jax.ops.attention import attend
 from cmig_jax.ops.best_target import best_target
 from cmig_jax.ops.convolution import convolve
 from cmig_jax.ops.edges import edge_moments, neighbour_maximum
+from cmig_jax.ops.kernels import is_fast
 from cmig_jax.ops.moments import moments, scale_about
 from cmig_jax.ops.neighbours import knn
-from cmig_jax.ops.pooling import max_pool, maximum
+from cmig_jax.ops.pooling import max_pool, maximum, selected_maximum
 from cmig_jax.ops.procrustes import project_to_rotation, weighted_procrustes
 
 BOUND = {"float64": 1e-10, "float32": 1e-5}
@@ -96,6 +97,7 @@ OPS = {
     "edge moments": Op(edges, ((2, 13, 4), (2, 13, 4), (2, 13, 3))),
     "edge moments in chunks": Op(edges, ((2, 13, 4), (2, 13, 4), (2, 13, 3)), rows=4),
     "edge moments of two clouds": Op(edges_of_two_clouds, ((2, 13, 4), (2, 13, 4), (2, 17, 4), (2, 17, 4)), rows=6),
+    "selected maximum": Op(lambda c, x: selected_maximum(x, 2) if is_fast(c.kernels) else maximum(x, 2, c.kernels), ((2, 5, 7, 3),)),
     "maximum": Op(lambda c, x: maximum(x, 1, c.kernels), ((2, 13, 4),)),
     "pooled windows": Op(lambda c, x: max_pool(x, c.kernels), ((2, 7, 10, 3),)),
     "moments": Op(statistics, ((2, 13, 4), (3, 5, 7, 4))),

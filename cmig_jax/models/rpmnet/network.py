@@ -15,8 +15,8 @@ from flax import struct
 from jax import Array
 
 from cmig_jax.config import ComputeConfig
-from cmig_jax.geometry.distances import squared_distances
-from cmig_jax.geometry.point_pairs import length, point_pair_features
+from cmig_jax.geometry.distances import length, squared_distances
+from cmig_jax.geometry.point_pairs import point_pair_features
 from cmig_jax.geometry.sinkhorn import log_sinkhorn
 from cmig_jax.models.base import Model
 from cmig_jax.models.rpmnet.flags import GROUPS, WIDE_GROUPS, RPMNetFlags

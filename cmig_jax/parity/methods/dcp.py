@@ -5,16 +5,13 @@ from __future__ import annotations
 from collections.abc import Callable, Iterator
 from typing import Literal
 
-import jax.numpy as jnp
 import numpy as np
 
 from cmig_jax.models.dcp.network import CYCLE_WEIGHT, DCPFlags
 from cmig_jax.parity.cases import Arrays, Case, State
 from cmig_jax.parity.layers import linear, normalisation, transformer
-from cmig_jax.parity.method import Method, Outcome, channels_second
+from cmig_jax.parity.method import Method, Outcome, channels_second, pair_batch_channels_second
 from cmig_jax.parity.weights import Tensor
-from cmig_jax.structs import Batch
-from cmig_jax.transform import RigidTransform
 
 Pointer = Literal["transformer", "identity"]
 INPUTS = {"src": "B 3 N", "tgt": "B 3 M", "R_gt": "B 3 3", "t_gt": "B 3"}
@@ -42,12 +39,6 @@ def encoder_widths(state: State) -> tuple[int, ...]:
     if len(found) < 2:
         raise ValueError("this state has no emb_nn.conv1.weight, emb_nn.conv2.weight")
     return tuple(found)
-
-
-def pair_batch(inputs: Arrays) -> Batch:
-    """Return the clouds and the true pose of a case in the official layout."""
-    source, target = (jnp.asarray(channels_second(inputs[name])) for name in ("src", "tgt"))
-    return Batch(source, target, target_from_source=RigidTransform(R=inputs["R_gt"], t=inputs["t_gt"]))
 
 
 def _layout(flags: DCPFlags) -> list[Tensor]:
@@ -95,7 +86,7 @@ def _method(name: str, pointer: Pointer) -> Method:
         flags_of_state=_of_state(pointer),
         layout=_layout,
         inputs=INPUTS,
-        batch=pair_batch,
+        batch=pair_batch_channels_second,
         stages={
             "StaticEdgeEncoder.graph": lambda i: [f"knn_{clouds[i]}"],
             "StaticEdgeEncoder.pooled": lambda i: [f"layer{j + 1}_{clouds[i]}" for j in range(len(DCPFlags.widths))],

@@ -10,8 +10,8 @@ from cmig_jax.models.cmignet.prediction import Iteration
 from cmig_jax.models.idam.flags import IDAMFlags
 from cmig_jax.parity.cases import Arrays, Case, State
 from cmig_jax.parity.layers import linear, normalisation
-from cmig_jax.parity.method import Method, Outcome, channels_second, is_training
-from cmig_jax.parity.methods.dcp import INPUTS, pair_batch
+from cmig_jax.parity.method import Method, Outcome, channels_second, is_training, pair_batch_channels_second
+from cmig_jax.parity.methods.dcp import INPUTS
 from cmig_jax.parity.weights import Tensor
 
 CLOUDS = ("tgt", "src")  # the order of the graph network's calls
@@ -136,7 +136,7 @@ IDAM_GNN = Method(
     flags_of_state=_of_state,
     layout=_layout,
     inputs=INPUTS,
-    batch=pair_batch,
+    batch=pair_batch_channels_second,
     stages=STAGES,
     results=_results,
     draws=_draws,

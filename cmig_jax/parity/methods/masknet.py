@@ -14,9 +14,8 @@ from cmig_jax.config import ComputeConfig
 from cmig_jax.models.masknet.flags import MaskNetFlags
 from cmig_jax.models.masknet.network import losses
 from cmig_jax.parity.cases import Arrays, Case, State
-from cmig_jax.parity.layers import linear, normalisation
-from cmig_jax.parity.method import Method, Outcome, channels_second
-from cmig_jax.parity.methods.pcrnet_iterative import pair_batch, pointnet_path, widths_of
+from cmig_jax.parity.layers import linear, normalisation, pointnet_path, widths_of
+from cmig_jax.parity.method import Method, Outcome, channels_second, pair_batch
 from cmig_jax.parity.weights import Tensor
 
 # The recorded order of the chosen points is arbitrary: `mask_idx` is read to put ours in that order.

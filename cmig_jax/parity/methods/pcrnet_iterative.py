@@ -5,14 +5,13 @@ from __future__ import annotations
 import itertools
 import re
 from collections.abc import Mapping
-from typing import Any, Literal
+from typing import Any
 
 from cmig_jax.models.pcrnet.flags import PCRNetFlags
 from cmig_jax.parity.cases import Arrays, Case, State
-from cmig_jax.parity.layers import linear
-from cmig_jax.parity.method import Method, Outcome
+from cmig_jax.parity.layers import linear, pointnet_path, widths_of
+from cmig_jax.parity.method import Method, Outcome, pair_batch
 from cmig_jax.parity.weights import Tensor
-from cmig_jax.structs import Batch
 from cmig_jax.transform import RigidTransform
 
 INPUTS = {"src": "B N 3", "tgt": "B M 3", "R_gt": "B 3 3", "t_gt": "B 3"}
@@ -39,29 +38,6 @@ def layout(flags: PCRNetFlags) -> list[Tensor]:
     for i, (inputs, width) in enumerate(itertools.pairwise((2 * flags.widths[-1], *flags.head_widths, 7))):
         tensors += linear(f"linear.{2 * i}", (width, inputs), f"head/layer_{i}")
     return tensors
-
-
-def widths_of(state: State, name: str) -> tuple[int, ...]:
-    """Return the output channels of the layers `name`, with `{}` for their number.
-
-    Raises:
-        ValueError: there is none.
-    """
-    form = re.compile(re.escape(name).replace(r"\{\}", r"(\d+)") + r"\.weight")
-    found = {int(match[1]): len(state[key]) for key in state if (match := form.fullmatch(key))}
-    if not found:
-        raise ValueError(f"this state has no {name.format('*')}.weight")
-    return tuple(found[number] for number in sorted(found))
-
-
-def pointnet_path(kind: Literal["layer", "norm"], i: int, widths: tuple[int, ...]) -> str:
-    """Return where layer i of the `PointNet` named `encoder` stands, or its normalisation."""
-    return f"encoder/layers/{kind}_{i}" if i + 1 < len(widths) else f"encoder/last{'' if kind == 'layer' else '_norm'}"
-
-
-def pair_batch(inputs: Mapping[str, Any]) -> Batch:
-    """Return the clouds, channels last, and the true pose of a case."""
-    return Batch(inputs["src"], inputs["tgt"], target_from_source=RigidTransform(inputs["R_gt"], inputs["t_gt"]))
 
 
 def overrides(case: Case) -> Mapping[str, tuple[str, Any]]:

@@ -11,9 +11,8 @@ import numpy as np
 
 from cmig_jax.models.pointnetlk.flags import PointNetLKFlags, revisited
 from cmig_jax.parity.cases import Arrays, Case, State
-from cmig_jax.parity.layers import linear, normalisation
+from cmig_jax.parity.layers import linear, normalisation, pointnet_path, widths_of
 from cmig_jax.parity.method import Method, Outcome
-from cmig_jax.parity.methods.pcrnet_iterative import pointnet_path, widths_of
 from cmig_jax.parity.weights import Tensor
 from cmig_jax.structs import Batch
 from cmig_jax.transform import RigidTransform

@@ -11,8 +11,8 @@ from numpy.typing import NDArray
 from cmig_jax.models.prnet.network import TEMPERATURE_WIDTHS, PRNetFlags
 from cmig_jax.parity.cases import Arrays, Case, State
 from cmig_jax.parity.layers import linear, normalisation, transformer
-from cmig_jax.parity.method import Method, Outcome, channels_second
-from cmig_jax.parity.methods.dcp import INPUTS, edge_encoder, encoder_widths, pair_batch
+from cmig_jax.parity.method import Method, Outcome, channels_second, pair_batch_channels_second
+from cmig_jax.parity.methods.dcp import INPUTS, edge_encoder, encoder_widths
 from cmig_jax.parity.weights import Tensor
 
 MOST_ITERATIONS = 8
@@ -119,7 +119,7 @@ PRNET = Method(
     layout=_layout,
     inputs=INPUTS | ORDERS | NOISE,
     optional=(*ORDERS, *NOISE),
-    batch=pair_batch,
+    batch=pair_batch_channels_second,
     stages={
         "PRNet.encode": lambda i: _per_cloud("feat")[i],
         "PRNet.embed": lambda i: [f"it{i}/emb_src", f"it{i}/emb_tgt"],

@@ -22,6 +22,8 @@ Sampling = Literal["once", "twice", "subsets"]
 Crop = Literal["shared", "independent", "half-space", "source", "none"]
 Turn = Literal["positive", "either", "any"]
 Poses = Literal["euler", "twist"]
+Drawn = Literal["each-pair", "each-object"]
+Noise = Literal["fixed", "uniform"]
 Normals = Literal["object", "observed"]
 Layout = Literal["dodecahedron", "ring", "axes"]
 Rule = tuple[str, bool, str]
@@ -85,11 +87,16 @@ class DataConfig:
     the source alone with a complete target (`source`: MaskNet), or no crop."""
     noise_std: float = 0.01
     """Standard deviation of the Gaussian noise on every coordinate, object units; 0 turns noise off (Sec. IV-B)."""
+    noise: Noise = "fixed"
+    """`uniform`: the standard deviation of each pair is drawn from [0, noise_std] (MaskNet)."""
     noise_clip: float = 0.05
     """Largest absolute noise, object units (Sec. IV-B)."""
     pose: Poses = "euler"
     """`euler`: rotation and translation as the next three flags say; `twist`: the exponential of a twist (w, v) of uniform direction in six
     dimensions and of uniform length in [0, max_twist], whatever those say (PointNetLK, MaskNet)."""
+    pose_of: Drawn = "each-pair"
+    """Whose pose is drawn: that of each pair, or one pose for each object, which it keeps throughout the training (PCRNet's released
+    code)."""
     max_angle_deg: float = 45.0
     """Each of the three Euler angles is uniform in [0, this], degrees (Sec. IV-B)."""
     turn: Turn = "positive"

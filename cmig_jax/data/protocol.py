@@ -16,7 +16,9 @@ SYMMETRIC = ("bottle", "bowl", "cone", "cup", "flower_pot", "lamp", "tent", "vas
 """ModelNet40's categories of rotationally symmetric objects; without them 32 are left, a protocol of the literature (`data.exclude`)."""
 
 
-def make_clouds(points: np.ndarray, data: DataConfig, name: object, rng: np.random.Generator) -> dict[str, np.ndarray]:
+def make_clouds(
+    points: np.ndarray, data: DataConfig, name: object, rng: np.random.Generator, poses: np.random.Generator | None = None
+) -> dict[str, np.ndarray]:
     """Draw the two clouds of a pair and the pose between them.
 
     Args:
@@ -24,6 +26,7 @@ def make_clouds(points: np.ndarray, data: DataConfig, name: object, rng: np.rand
         data: flags of the protocol.
         name: name of the object in an error.
         rng: random generator.
+        poses: random generator of the pose (default: `rng`).
 
     Returns:
         `source [N, 3]`, `target [M, 3]`, `R [3, 3]`, `t [3]` float32, with target = R source + t; with normals also
@@ -33,11 +36,12 @@ def make_clouds(points: np.ndarray, data: DataConfig, name: object, rng: np.rand
         ValueError: the object has too few points for `data.points` and `data.sampling`.
     """
     source, target = samplings(points, data.points, data.sampling, name, rng)
-    R, t = draw_pose(rng, data)
+    R, t = draw_pose(poses or rng, data)
     clouds = [source, _moved(target, R, t)]
     clouds = [cloud[rng.permutation(len(cloud))] for cloud in clouds]
     if data.noise_std > 0:
-        clouds = [_noisy(cloud, data.noise_std, data.noise_clip, rng) for cloud in clouds]
+        deviation = rng.uniform(0, data.noise_std) if data.noise == "uniform" else data.noise_std
+        clouds = [_noisy(cloud, deviation, data.noise_clip, rng) for cloud in clouds]
     source, target = crop(clouds[0], clouds[1], data.crop, data.keep, rng)
     pair = {"source": source[:, :3], "target": target[:, :3], "R": R, "t": t}
     if points.shape[1] == 6:

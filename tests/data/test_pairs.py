@@ -49,6 +49,14 @@ def by_name(objects, indices, views):
     return dict(zip(pairs.names, pairs, strict=True))
 
 
+@pytest.mark.parametrize(("pose_of", "poses"), [("each-pair", 6), ("each-object", 2)])
+def test_an_object_keeps_its_pose_or_has_one_for_each_pair(pose_of, poses):
+    pairs = Pairs(Objects(), np.arange(2), replace(DATA, pose_of=pose_of), None, 0)
+    drawn = [pairs.draw(position, np.random.default_rng([position, epoch])) for position in (0, 1) for epoch in range(3)]
+    assert len({pair["R"].tobytes() for pair in drawn}) == len({pair["t"].tobytes() for pair in drawn}) == poses
+    assert len({pair["source"].tobytes() for pair in drawn}) == 6
+
+
 @pytest.mark.parametrize("views", [None, VIEWS, BOTH, replace(BOTH, shown="shuffled")])
 def test_a_pair_is_a_function_of_seed_and_object_whichever_other_objects_there_are(views):
     objects = Objects()

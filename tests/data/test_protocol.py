@@ -225,6 +225,18 @@ def test_an_object_of_too_few_points_is_named(sampling, count):
         draw(replace(CLEAN, points=count, sampling=sampling))
 
 
+def test_uniform_noise_has_a_deviation_for_each_pair_from_none_to_the_largest():
+    data = replace(CLEAN, noise_std=0.02, noise_clip=1.0, noise="uniform")
+    deviations = []
+    for seed in range(200):
+        pair = draw(data, seed)
+        gaps = distances(undone(pair), OBJECT[:100]).min(axis=1)
+        deviations.append(np.sqrt(np.mean(gaps**2) / 3))  # of three coordinates; a little small where another point is nearer
+    assert 0 < min(deviations) < 0.001
+    assert 0.017 < max(deviations) < 0.021
+    np.testing.assert_allclose(np.quantile(deviations, [0.25, 0.5, 0.75]), [0.005, 0.01, 0.015], atol=0.002)
+
+
 def test_noise_is_clipped_and_drawn_for_each_cloud():
     pair, clean = draw(replace(CLEAN, noise_std=0.04, noise_clip=0.05)), draw(CLEAN)
     noise = [pair[name] - clean[name] for name in ("source", "target")]

@@ -24,6 +24,7 @@ Turn = Literal["positive", "either", "any"]
 Poses = Literal["euler", "twist"]
 Drawn = Literal["each-pair", "each-object"]
 Noise = Literal["fixed", "uniform"]
+Tested = Literal["test", "validation"]
 Normals = Literal["object", "observed"]
 Layout = Literal["dodecahedron", "ring", "axes"]
 Rule = tuple[str, bool, str]
@@ -112,6 +113,9 @@ class DataConfig:
     estimate them from the observed clouds in either case."""
     validation: float = 0.1
     """Share of the training objects held out to choose the checkpoint; the test split is never used for that."""
+    tested: Tested = "test"
+    """Objects that are evaluated on: those of the test file, or the training objects that `validation` holds out. A network, a flag or a
+    constant is chosen on the latter."""
     test_seed: int = 1234
     """Seed of the validation and test pairs: a pair is a function of this seed and its object."""
     workers: int = 0

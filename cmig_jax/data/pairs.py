@@ -155,6 +155,23 @@ def in_categories(labels: np.ndarray, categories: Sequence[str], which: Categori
     return np.flatnonzero(keep & ~np.isin(labels, left_out))
 
 
+def training_objects(objects: Shards, data: DataConfig) -> tuple[np.ndarray, np.ndarray]:
+    """Return the numbers of the objects of `data.categories` to train on, and of those held out for validation, `[m]` each.
+
+    Args:
+        objects: of the training split.
+        data: its categories, and what `split_validation` reads.
+
+    Raises:
+        ValueError: fewer than two objects in these categories.
+    """
+    chosen = in_categories(objects.labels, objects.categories, data.categories, data.exclude)
+    if len(chosen) < 2:
+        where = f"data.categories={data.categories} without data.exclude={data.exclude}"
+        raise ValueError(f"{objects.folder}: expected at least 2 training objects in {where}, got {len(chosen)}")
+    return split_validation(chosen, objects.names, data.validation, data.test_seed)
+
+
 def evenly_spaced(count: int, limit: int | None) -> np.ndarray:
     """Return `limit` positions of `count`, evenly spaced; all of them where the limit is None, or more.
 

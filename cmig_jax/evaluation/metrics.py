@@ -21,6 +21,8 @@ from cmig_jax.transform import RigidTransform, check_transform
 RECALL_DEG = 5.0
 RECALL_LENGTH = 0.05
 RECALL_CLOSEST_POINT = 0.03
+WIDER_RECALLS = {10: 0.1, 15: 0.15}
+"""Degrees and lengths of wider recalls: a pose that near is one that a refinement can start from."""
 
 Floats = NDArray[np.float64]
 
@@ -39,7 +41,8 @@ def registration_metrics(
     Returns:
         `rmse_r_deg`, `mae_r_deg` over all Euler angles of all pairs (`euler_errors`); `rmse_t`, `mae_t` over all components;
         `iso_r_deg_mean`, `iso_r_deg_median`, `iso_t_mean`, `iso_t_median` (`isotropic_errors`); `recall`, the share of pairs below both
-        5 degrees and 0.05; `closest_point`, its mean, and `recall_closest_point`, the share below 0.03; `chamfer`, its mean.
+        5 degrees and 0.05, `recall_10_deg` below 10 and 0.1, `recall_15_deg` below 15 and 0.15; `closest_point`, its mean, and
+        `recall_closest_point`, the share below 0.03; `chamfer`, its mean.
 
     Raises:
         ValueError: no pair, different numbers of pairs, or a pose that is not valid (not finite, or R not a rotation). An invalid
@@ -62,6 +65,8 @@ def registration_metrics(
         "iso_t_median": np.median(iso_t),
         "recall": np.mean((iso_r < RECALL_DEG) & (iso_t < RECALL_LENGTH)),
     }
+    for angle, distance in WIDER_RECALLS.items():
+        metrics[f"recall_{angle}_deg"] = np.mean((iso_r < angle) & (iso_t < distance))
     if closest_point is not None:
         distances = _distances(closest_point, n, "closest_point")
         metrics["closest_point"] = np.mean(distances)

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from cmig_jax.config import Config, views_to_prepare
-from cmig_jax.data.pairs import Pairs, evenly_spaced, in_categories
+from cmig_jax.data.pairs import Pairs, evenly_spaced, in_categories, training_objects
 from cmig_jax.data.prepare import ensure_prepared
 from cmig_jax.data.recorded_pairs import RecordedPairs
 from cmig_jax.data.recordings import ensure_recordings
@@ -12,7 +12,7 @@ from cmig_jax.data.sources import source_of
 
 
 def pairs_to_test(config: Config, limit: int | None = None) -> Pairs | RecordedPairs:
-    """Return the test pairs of a config: those of `data.test_categories`, or the recorded ones.
+    """Return the pairs to evaluate on: test objects of `data.test_categories`, the objects held out for validation, or recorded pairs.
 
     Args:
         config: `data`, `views`, and whether the network reads views and normals.
@@ -28,8 +28,13 @@ def pairs_to_test(config: Config, limit: int | None = None) -> Pairs | RecordedP
     views = config.views if needs.views else None
     if source_of(data).records:
         return RecordedPairs(ensure_recordings(data), data, views, limit, normals=needs.normals)
-    objects = Shards(folder := ensure_prepared(data, views_to_prepare(config)), "test")
-    chosen = in_categories(objects.labels, objects.categories, data.test_categories, data.exclude)
+    folder = ensure_prepared(data, views_to_prepare(config))
+    if data.tested == "validation":
+        objects = Shards(folder, "train")
+        chosen = training_objects(objects, data)[1]
+    else:
+        objects = Shards(folder, "test")
+        chosen = in_categories(objects.labels, objects.categories, data.test_categories, data.exclude)
     chosen = chosen[evenly_spaced(len(chosen), limit)]
     if len(chosen) == 0:
         where = f"data.test_categories={data.test_categories} without data.exclude={data.exclude}"

@@ -7,6 +7,7 @@ from html import escape
 from typing import Any, Literal, NamedTuple
 
 from cmig_jax.evaluation.engine import METADATA
+from cmig_jax.evaluation.metrics import WIDER_RECALLS
 
 Rows = Sequence[Sequence[str]]
 
@@ -36,6 +37,10 @@ COLUMNS = (
     Column("seconds_per_pair", "time", "ms/pair", 1, 1000.0, "none"),
 )
 """Lengths are in units of the normalised object."""
+WIDER = tuple(
+    Column(f"recall_{angle}_deg", f"within {angle} deg, {distance:g}", "%", 1, 100.0, "high") for angle, distance in WIDER_RECALLS.items()
+)
+"""For experiments that ask for starts of a refinement."""
 
 
 def text_table(results: Mapping[str, Any]) -> str:

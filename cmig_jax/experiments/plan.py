@@ -17,7 +17,7 @@ from cmig_jax.data.sources import source_of
 from cmig_jax.experiments.schema import Catalogue, Experiment, Flags, Row
 from cmig_jax.models.networks import config_from_json
 
-ONLY_AT_TEST = ("data.test_categories",)
+ONLY_AT_TEST = ("data.test_categories", "data.tested")
 """Flags that a training does not depend on."""
 
 

@@ -53,12 +53,14 @@ class Experiment:
         protocol: data flags of all its rows.
         rows: the rows.
         baselines: whether methods without learning stand beside the rows.
+        columns: metrics to show, of `evaluation.tables`.
     """
 
     about: str
     protocol: Flags
     rows: tuple[Row, ...]
     baselines: bool = False
+    columns: tuple[str, ...] = ("rmse_r_deg", "mae_r_deg", "rmse_t", "mae_t", "recall", "seconds_per_pair")
 
 
 @dataclass(frozen=True)

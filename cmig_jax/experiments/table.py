@@ -7,12 +7,11 @@ from collections.abc import Mapping, Sequence
 from dataclasses import asdict
 from typing import Any
 
-from cmig_jax.evaluation.tables import COLUMNS, Column, latex_rows, latex_text, markdown_rows, text_rows
+from cmig_jax.evaluation.tables import COLUMNS, WIDER, Column, latex_rows, latex_text, markdown_rows, text_rows
 from cmig_jax.experiments.run import Outcome, Results
 from cmig_jax.experiments.schema import Experiment, Row
 
-SHOWN = tuple(column for column in COLUMNS if column.key in ("rmse_r_deg", "mae_r_deg", "rmse_t", "mae_t", "recall", "seconds_per_pair"))
-QUOTED = tuple(column for column in SHOWN if column.key in ("rmse_r_deg", "mae_r_deg", "rmse_t", "mae_t"))
+QUOTED = tuple(column for column in COLUMNS if column.key in ("rmse_r_deg", "mae_r_deg", "rmse_t", "mae_t"))
 EMPTY = "–"
 
 
@@ -24,14 +23,15 @@ def table(experiment: Experiment, results: Results, style: str = "text") -> str:
         results: of its jobs.
         style: `text` for a terminal, `markdown`, or `latex` (package booktabs).
     """
-    rows = [[name, "", *(_cell(column, [metrics]) for column in SHOWN)] for name, metrics in results.baselines.items()]
-    rows += [_row(row, [o for o in results.outcomes if o.job.row is row]) for row in experiment.rows]
+    shown = [column for column in (*COLUMNS, *WIDER) if column.key in experiment.columns]
+    rows = [[name, "", *(_cell(column, [metrics]) for column in shown)] for name, metrics in results.baselines.items()]
+    rows += [_row(row, [o for o in results.outcomes if o.job.row is row], shown) for row in experiment.rows]
     quoted = any(row.quoted for row in experiment.rows)
     if quoted:
         empty = [EMPTY] * len(QUOTED)
         figures = [empty] * len(results.baselines) + [_quoted(row) for row in experiment.rows]
         rows = [[*row, *cells] for row, cells in zip(rows, figures, strict=True)]
-    headings = ["", "seeds", *(f"{c.heading} [{c.unit}]" for c in SHOWN), *(f"quoted {c.heading}" for c in QUOTED if quoted)]
+    headings = ["", "seeds", *(f"{c.heading} [{c.unit}]" for c in shown), *(f"quoted {c.heading}" for c in QUOTED if quoted)]
     if style == "latex":
         headings, *rows = [[latex_text(cell) for cell in row] for row in [headings, *rows]]
     return {"text": text_rows, "markdown": markdown_rows, "latex": latex_rows}[style]([headings], rows)
@@ -71,11 +71,11 @@ def spread(values: Sequence[float]) -> tuple[float, float]:
     return statistics.fmean(values), statistics.stdev(values) if len(values) > 1 else 0.0
 
 
-def _row(row: Row, outcomes: Sequence[Outcome]) -> list[str]:
+def _row(row: Row, outcomes: Sequence[Outcome], shown: Sequence[Column]) -> list[str]:
     found = [o.metrics for o in outcomes if o.metrics is not None]
     failed = sum(o.problem.startswith("failed") for o in outcomes)
     seeds = f"{len(found)}" + (f", {failed} failed" if failed else "")
-    return [row.label, seeds if outcomes else EMPTY, *(_cell(column, found) for column in SHOWN)]
+    return [row.label, seeds if outcomes else EMPTY, *(_cell(column, found) for column in shown)]
 
 
 def _cell(column: Column, found: Sequence[Mapping[str, float]]) -> str:

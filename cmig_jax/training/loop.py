@@ -18,7 +18,7 @@ from jax.sharding import Mesh
 
 from cmig_jax.config import Config, views_to_prepare
 from cmig_jax.data.loader import BatchIterator, epoch_steps, training_batches
-from cmig_jax.data.pairs import Pair, Pairs, in_categories, split_validation
+from cmig_jax.data.pairs import Pair, Pairs, training_objects
 from cmig_jax.data.prepare import ensure_prepared
 from cmig_jax.data.shards import Shards
 from cmig_jax.data.sources import source_of
@@ -91,12 +91,8 @@ def training_data(config: Config) -> TrainingData:
     if data.cropped_points < needs.training_points:
         left = f"data.points = {data.points} leaves {data.cropped_points} points after the crop"
         raise ValueError(f"{left}: expected at least {needs.training_points}, the network's neighbours and keypoints in training")
-    objects = Shards(folder := ensure_prepared(data, views_to_prepare(config)), "train")
-    chosen = in_categories(objects.labels, objects.categories, data.categories, data.exclude)
-    if len(chosen) < 2:
-        where = f"data.categories={data.categories} without data.exclude={data.exclude}"
-        raise ValueError(f"{folder}: expected at least 2 training objects in {where}, got {len(chosen)}")
-    train, held = split_validation(chosen, objects.names, data.validation, data.test_seed)
+    objects = Shards(ensure_prepared(data, views_to_prepare(config)), "train")
+    train, held = training_objects(objects, data)
     views, normals = config.views if needs.views else None, needs.normals
     return TrainingData(
         train=Pairs(objects, train, data, views, config.seed, normals=normals),

@@ -15,6 +15,7 @@ from cmig_jax.devices import device_mesh
 from cmig_jax.evaluation.engine import ERRORS, METADATA, PARTIAL, RESULTS, evaluate, one_by_one
 from cmig_jax.evaluation.pairs import pairs_to_test
 from cmig_jax.training.checkpoint import Checkpoints, write_config
+from cmig_jax.training.loop import training_data
 from cmig_jax.training.optim import optimizer
 from cmig_jax.training.state import build, create_state
 from cmig_jax.transform import RigidTransform
@@ -160,6 +161,13 @@ def test_excluded_categories_are_not_tested(tiny):
         pairs_to_test(replace(tiny, data=replace(tiny.data, exclude=("vase",))))
     with pytest.raises(ValueError, match=r"data\.test_categories=first-half without data\.exclude=\('bottle', 'bowl'\), found none"):
         pairs_to_test(replace(tiny, data=replace(tiny.data, test_categories="first-half", exclude=("bottle", "bowl"))))
+
+
+def test_validation_pairs_are_those_that_the_training_holds_out(tiny):
+    held, trained = pairs_to_test(replace(tiny, data=replace(tiny.data, tested="validation"))), training_data(tiny)
+    assert list(held.names) == list(trained.validation.names)
+    assert not set(held.names) & set(trained.train.names)
+    np.testing.assert_array_equal(held[0]["target"], trained.validation[0]["target"])
 
 
 def test_rpmnet_s_protocol_keeps_70_percent_of_independent_samplings(tiny, tmp_path):

@@ -25,8 +25,8 @@ IDENTITY = pose(np.eye(3))
 
 def test_zero_at_the_truth(poses):
     metrics = registration_metrics(poses, poses, closest_point=np.zeros(50), chamfer=np.zeros(50))
-    shares = {name: metrics.pop(name) for name in ("recall", "recall_closest_point")}
-    assert shares == {"recall": 1.0, "recall_closest_point": 1.0}
+    shares = {name: metrics.pop(name) for name in ("recall", "recall_10_deg", "recall_15_deg", "recall_closest_point")}
+    assert set(shares.values()) == {1.0}
     np.testing.assert_allclose(list(metrics.values()), 0, atol=1e-5)
 
 
@@ -45,8 +45,19 @@ def test_a_quarter_turn():
         "iso_t_mean": 0.25,
         "iso_t_median": 0.25,
         "recall": 0.5,
+        "recall_10_deg": 0.5,
+        "recall_15_deg": 0.5,
     }
     assert metrics == pytest.approx(expected)
+
+
+def test_recalls_need_both_a_small_angle_and_a_short_shift():
+    angles, shifts = [4.9, 5.1, 9.9, 10.1, 14.9, 15.1, 0, 0, 0, 0], [0, 0, 0, 0, 0, 0, 0.051, 0.099, 0.101, 0.151]
+    found = pose(
+        Rotation.from_rotvec(np.radians(angles)[:, None] * [0, 0, 1]).as_matrix(), np.stack([shifts, np.zeros(10), np.zeros(10)], axis=1)
+    )
+    metrics = registration_metrics(found, pose(np.eye(3)[None].repeat(10, 0), np.zeros((10, 3))))
+    assert (metrics["recall"], metrics["recall_10_deg"], metrics["recall_15_deg"]) == (0.1, 0.5, 0.8)
 
 
 def test_euler_angles_are_those_the_pairs_are_drawn_with():

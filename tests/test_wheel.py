@@ -54,8 +54,18 @@ def test_it_registers_two_files(cmig):
 
 
 def test_it_trains_a_preset_and_reports(cmig):
-    small = ["--data.shapes", 4, "--optim.epochs", 1, "--optim.batch", 8, "--model.matching.iterations", 1]
-    done = cmig("train", "quickstart", *small)
+    data = ["--data.shapes", 4, "--data.points", 64, "--optim.epochs", 1, "--optim.batch", 8]
+    network = [
+        "--model.matching.iterations",
+        1,
+        "--model.keypoints.count",
+        16,
+        "--model.fusion.image",
+        "none",
+        "--model.loss.cross-modal",
+        "off",
+    ]
+    done = cmig("train", "quickstart", *data, *network)
     assert done.returncode == 0, done.stderr
     done = cmig("evaluate", "runs/quickstart", "--limit", 4, "--batch", 4, "--report")
     assert done.returncode == 0, done.stderr

@@ -121,7 +121,7 @@ def test_derivatives_are_finite_for_copies_of_points_lonely_points_and_normals_o
 
 
 def test_terms_are_discounted_and_vanish_for_the_true_pose(variables, x64):
-    prediction = NETWORK.apply(variables, batch(), train=True)
+    prediction = jax.jit(functools.partial(NETWORK.apply, train=True))(variables, batch())
     terms = {f: RPMNET.losses(prediction, batch(), dataclasses.replace(FLAGS, discount=f), ComputeConfig()) for f in (1.0, 0.25)}
     for name, value in terms[1.0].items():
         np.testing.assert_allclose(terms[0.25][name], value * (0.25 if name.endswith("_0") else 1))

@@ -83,6 +83,8 @@ class DataConfig:
     a random subset of the object's prepared points, so that they share some points (RPM-Net)."""
     keep: float = 0.75
     """Share of the points that the crop keeps (Sec. IV-B removes 25 %)."""
+    keep_least: float = 0.0
+    """Above 0, the share of each pair is drawn from [this, keep], of so many more points that as many are left as with `keep`."""
     crop: Crop = "shared"
     """Crop around one far point for both clouds, one far point each (lower overlap), a random half-space each (RPM-Net), a far point for
     the source alone with a complete target (`source`: MaskNet), or no crop."""
@@ -126,6 +128,12 @@ class DataConfig:
             [
                 (f"data.points = {self.points}", self.points >= 1, "at least 1"),
                 (f"data.keep = {self.keep}", 0 < self.keep <= 1, "a share in (0, 1]"),
+                (f"data.keep_least = {self.keep_least}", 0 <= self.keep_least <= self.keep, f"0, or a share of at most keep = {self.keep}"),
+                (
+                    f"data.keep_least = {self.keep_least} with data.crop = {self.crop}",
+                    self.keep_least == 0 or self.crop in ("shared", "independent", "half-space"),
+                    "a crop of both clouds",
+                ),
                 (f"data.points = {self.points}, data.keep = {self.keep}", self.cropped_points >= 1, "at least one point left"),
                 (f"data.noise_std = {self.noise_std}", 0 <= self.noise_std < math.inf, "0 or more"),
                 (f"data.noise_clip = {self.noise_clip}", self.noise_clip >= 0, "0 or more"),
@@ -143,6 +151,11 @@ class DataConfig:
     def cropped_points(self) -> int:
         """Points after the crop: of each cloud, or of the source with `crop=source`."""
         return self.points if self.crop == "none" else round(self.points * self.keep)
+
+    @property
+    def most_points(self) -> int:
+        """Points per cloud before the crop, at most."""
+        return math.ceil(self.cropped_points / self.keep_least) if self.keep_least else self.points
 
     @property
     def target_points(self) -> int:

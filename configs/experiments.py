@@ -11,6 +11,7 @@ from cmig_jax.data.protocol import SYMMETRIC
 from cmig_jax.experiments.schema import Experiment, Flags, Quoted, Row
 
 from .compared import PROTOCOL, compared
+from .starts import STARTS
 
 UNCHANGED: Flags = {}
 CLEAN: Flags = {**PROTOCOL, "data.noise_std": 0.0}
@@ -232,4 +233,5 @@ EXPERIMENTS: dict[str, Experiment] = {
         _recorded("sevenscenes-fragments"),
         baselines=True,
     ),
+    "starts": STARTS,
 }

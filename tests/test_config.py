@@ -20,9 +20,9 @@ REFUSED_BY_GROUP = [
     ("", {"name": ["", "../elsewhere", "/anywhere"], "seed": [-1]}),
     ("data.", {"points": [0], "keep": [0.0, 1.5, -0.1], "validation": [0.0, 1.0], "shapes": [3], "test_seed": [-1], "workers": [-1]}),
     ("data.", {"noise_std": [-0.01, math.inf], "noise_clip": [-0.05], "max_angle_deg": [-1.0, 181.0], "max_translation": [-0.5, math.inf]}),
-    ("data.", {"max_twist": [-0.1, math.inf]}),
+    ("data.", {"max_twist": [-0.1, math.inf], "keep_least": [-0.1, 0.8]}),
     ("views.", {"count": [12, 0], "size": [7]}),
-    ("model.points.", {"k": [0], "widths": [(), (64, 0)], "dim": [2]}),
+    ("model.points.", {"k": [0], "widths": [(), (64, 0)], "dim": [2], "local_widths": [(), (12,)]}),
     ("model.image.", {"widths": [(64, 128, 256, 511)], "blocks": [(2, 2, 2)]}),
     ("model.fusion.", {"heads": [0, 3], "feed_forward": [0]}),
     ("model.keypoints.", {"count": [1], "test_count": [-1, 1]}),
@@ -96,12 +96,24 @@ def test_every_rule_is_tested_above(monkeypatch):
     for module in (cmig_jax.config, cmignet):
         monkeypatch.setattr(module, "check", lambda rules: ruled.update(name.split(" = ")[0] for name, _, _ in rules))
     Config(name="paper", model=cmignet.CMIGNetFlags())
-    assert ruled == set(REFUSED) | {"model.fusion.image", "data.crop"}
+    assert ruled == set(REFUSED) | {"model.fusion.image", "data.crop", "model.keypoints.target"}
 
 
 def test_tied_image_fusion_needs_the_transformer_whose_weights_it_shares():
     with pytest.raises(ValueError, match=r"model\.fusion\.image = transformer with model\.fusion\.points = none"):
         changed(PAPER, "model.fusion", cmignet.FusionFlags(points="none", image="transformer"))
+
+
+def test_overlap_scores_are_predicted_logits():
+    for keypoints in ({"select": "random"}, {"activation": "sigmoid"}):
+        with pytest.raises(ValueError, match=r"model\.keypoints\.target = overlap, .*: expected model\.keypoints\.select = predicted"):
+            changed(PAPER, "model.keypoints", cmignet.KeypointsFlags(target="overlap", **keypoints))
+
+
+def test_a_share_is_drawn_for_crops_of_both_clouds():
+    for crop in ("source", "none"):
+        with pytest.raises(ValueError, match=rf"data\.keep_least = 0\.4 with data\.crop = {crop}: expected a crop of both clouds"):
+            DataConfig(keep_least=0.4, crop=crop)
 
 
 def test_rules_hold_only_where_the_flag_is_used():

@@ -148,7 +148,10 @@ def listing(catalogue: Catalogue) -> list[str]:
 
 
 def _flags(flags: Flags) -> str:
-    return " ".join(f"{flag}={' '.join(value) if isinstance(value, tuple) else value}" for flag, value in flags.items()) or "as it is"
+    return (
+        " ".join(f"{flag}={' '.join(map(str, value)) if isinstance(value, tuple) else value}" for flag, value in flags.items())
+        or "as it is"
+    )
 
 
 def write(folder: Path, name: str, experiment: Experiment, results: Results) -> None:

@@ -120,7 +120,7 @@ def _stored_points(data: DataConfig, raw: RawDataset) -> int:
     """Return P: enough for two independent samplings, but no more than a cloud in random order has."""
     if not raw.objects:
         raise ValueError(f"data.source = {data.source}, data.root = {data.root}: 0 objects; expected at least 1")
-    wanted = 2 * max(1024, data.points)
+    wanted = 2 * max(1024, data.most_points)
     if not raw.objects[0].shuffled:
         return wanted
     geometry = raw.objects[0].geometry()

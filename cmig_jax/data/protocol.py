@@ -35,14 +35,18 @@ def make_clouds(
     Raises:
         ValueError: the object has too few points for `data.points` and `data.sampling`.
     """
-    source, target = samplings(points, data.points, data.sampling, name, rng)
+    count = data.points
+    if data.keep_least:
+        count = round(data.cropped_points / rng.uniform(data.keep_least, data.keep))
+    source, target = (cloud[:count] for cloud in samplings(points, data.most_points, data.sampling, name, rng))
     R, t = draw_pose(poses or rng, data)
     clouds = [source, _moved(target, R, t)]
     clouds = [cloud[rng.permutation(len(cloud))] for cloud in clouds]
     if data.noise_std > 0:
         deviation = rng.uniform(0, data.noise_std) if data.noise == "uniform" else data.noise_std
         clouds = [_noisy(cloud, deviation, data.noise_clip, rng) for cloud in clouds]
-    source, target = crop(clouds[0], clouds[1], data.crop, data.keep, rng)
+    keep = data.cropped_points / count if data.keep_least else data.keep
+    source, target = crop(clouds[0], clouds[1], data.crop, keep, rng)
     pair = {"source": source[:, :3], "target": target[:, :3], "R": R, "t": t}
     if points.shape[1] == 6:
         pair |= {"source_normals": source[:, 3:], "target_normals": target[:, 3:]}

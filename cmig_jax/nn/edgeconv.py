@@ -51,9 +51,17 @@ class PointEncoder(nn.Module):
     negative_slope: float = 0.0
 
     @nn.compact
-    def __call__(self, clouds: Clouds, *, train: bool) -> Clouds:
-        """Encode clouds, each `[B, N_c, 3]`, to `[B, N_c, dim]`; batch statistics are taken over all of them together."""
+    def __call__(self, clouds: Clouds, *, train: bool, local: Clouds = ()) -> Clouds:
+        """Encode clouds, each `[B, N_c, 3]`, to `[B, N_c, dim]`; batch statistics are taken over all of them together.
+
+        Args:
+            clouds: coordinates.
+            train: use batch statistics.
+            local: `[B, N_c, F]` further features of the points, which linked layers read with the coordinates.
+        """
         collected, latest = [(cloud,) if self.linked else () for cloud in clouds], clouds
+        if local:
+            collected = [(*parts, features) for parts, features in zip(collected, local, strict=True)]
         for i, width in enumerate(self.widths):
             neighbours = tuple(knn(x, self.k, self.compute) for x in latest)
             inputs = tuple(jnp.concatenate(parts, axis=-1) for parts in collected) if self.linked else latest

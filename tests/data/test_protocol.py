@@ -176,6 +176,20 @@ def test_one_far_point_overlaps_more_than_two():
     np.testing.assert_array_equal(shared_share("none"), 1)
 
 
+@pytest.mark.parametrize("sampling", ["once", "twice"])
+def test_a_share_drawn_for_each_pair_leaves_equally_many_points_of_a_smaller_part(sampling):
+    data = replace(CLEAN, points=80, keep=0.75, keep_least=0.4, crop="shared", sampling=sampling)
+    assert data.most_points == 150
+    pairs = [draw(data, seed) for seed in range(40)]
+    assert {pair[cloud].shape for pair in pairs for cloud in ("source", "target")} == {(60, 3)}
+    # Along the diagonal that a crop cuts across, a share of a Gaussian cloud is the shorter the smaller it is.
+    diagonal = np.ones(3) / np.sqrt(3)
+    lengths = np.array([np.ptp(pair["source"] @ diagonal) for pair in pairs])
+    whole = np.mean([np.ptp(draw(replace(data, keep_least=0.75), seed)["source"] @ diagonal) for seed in range(40)])
+    assert lengths.mean() < whole
+    assert lengths.std() > 0.03
+
+
 def test_far_points_lie_along_the_diagonal_to_either_side():
     cloud = np.random.default_rng(0).normal(size=(200, 3))
     sides = []

@@ -19,6 +19,11 @@ class PointsFlags:
     """Channels of the EdgeConv layers."""
     dim: int = 512
     """Channels C of the point features."""
+    local: Literal["none", "pairs"] = "none"
+    """What the encoder reads beside coordinates; `pairs`: features of a point's pairs with its neighbours, from normals, that no turn
+    changes (not in the paper; after RPM-Net)."""
+    local_widths: tuple[int, ...] = (32, 32)
+    """Channels of the layers of `local=pairs`, multiples of 8."""
 
 
 @dataclass(frozen=True)
@@ -60,6 +65,9 @@ class KeypointsFlags:
     """Whose point features score a cloud's points; `other` (the released network) needs clouds of equal size."""
     activation: Literal["linear", "sigmoid"] = "linear"
     """Last activation of the score; its target is a negative entropy, at most 0, which a sigmoid cannot reach."""
+    target: Literal["entropy", "overlap"] = "entropy"
+    """What a score learns: the negative entropy of the point's matching, or the logit that the point has a partner, which then weighs its
+    correspondence too (not in the paper)."""
 
 
 @dataclass(frozen=True)
@@ -72,8 +80,11 @@ class MatchingFlags:
     """Iterations n, each with its own weights."""
     repeats: int = 0
     """Further iterations in evaluation, with the weights of the last; 0 is the paper's."""
-    correspondence: Literal["hard", "soft"] = "hard"
-    """Correspondent of a source keypoint: the best target keypoint, or the mean of all under the softmax of the matching."""
+    correspondence: Literal["hard", "soft", "sinkhorn"] = "hard"
+    """Correspondent of a source keypoint: the best target keypoint, the mean of all under the softmax of the matching, or under Sinkhorn's
+    normalisation with slack, whose rows then weigh the correspondences too (not in the paper; RPM-Net's)."""
+    features: Literal["once", "anew"] = "once"
+    """`anew`: each of the n iterations encodes the source as the ones before have moved it (not in the paper; PRNet's)."""
     feature_widths: tuple[int, ...] = (256, 128, 64, 32, 32, 32)
     """Channels of the feature similarity network."""
     coordinate_widths: tuple[int, ...] = (32, 32, 32)
@@ -142,6 +153,7 @@ class CMIGNetFlags(ModelFlags):
             pairs=1 if self.loss.cross_modal == "off" else 2,
             views=self.fusion.image != "none" or self.loss.cross_modal != "off",
             equal_sizes=self.keypoints.select == "predicted" and self.keypoints.score_from == "other",
+            normals=self.points.local == "pairs",
         )
 
     def _rules(self) -> list[tuple[str, bool, str]]:
@@ -150,6 +162,11 @@ class CMIGNetFlags(ModelFlags):
             (f"points.k = {points.k}", points.k >= 1, "at least 1"),
             (f"points.widths = {points.widths}", _positive(points.widths), "one or more numbers above 0"),
             (f"points.dim = {points.dim}", points.dim >= 4, "at least 4"),
+            (
+                f"points.local_widths = {points.local_widths}",
+                _positive(points.local_widths) and not any(width % 8 for width in points.local_widths),
+                "one or more multiples of 8",
+            ),
             (
                 f"image.widths = {image.widths}",
                 _positive(image.widths) and (not self.needs.views or image.widths[-1] == points.dim),
@@ -171,6 +188,11 @@ class CMIGNetFlags(ModelFlags):
                 "model.fusion.points = transformer, whose weights it shares",
             ),
             (f"fusion.feed_forward = {fusion.feed_forward}", fusion.feed_forward >= 1, "at least 1"),
+            (
+                f"keypoints.target = overlap, select = {self.keypoints.select}, activation = {self.keypoints.activation}",
+                self.keypoints.target == "entropy" or (self.keypoints.select, self.keypoints.activation) == ("predicted", "linear"),
+                "model.keypoints.select = predicted and activation = linear with overlap",
+            ),
             (f"keypoints.count = {self.keypoints.count}", self.keypoints.count >= 2, "at least 2"),
             (
                 f"keypoints.test_count = {self.keypoints.test_count}",

@@ -35,10 +35,11 @@ class Match:
 
 @struct.dataclass
 class KeypointSet:
-    """Keypoints of one cloud: coordinates `[B, K, 3]` and hybrid features `[B, K, C]`."""
+    """Keypoints of one cloud: coordinates `[B, K, 3]`, hybrid features `[B, K, C]`, and maybe `[B, K]` how surely they have a partner."""
 
     points: Array
     features: Array
+    overlap: Array | None = None
 
 
 class CMIGNetHead(nn.Module):

@@ -20,6 +20,7 @@ from cmig_jax.structs import Batch
 from cmig_jax.transform import RigidTransform
 
 T = TypeVar("T")
+SMALLEST_SLACK = 1e-6
 
 
 def losses(prediction: CMIGNetPrediction, batch: Batch, flags: CMIGNetFlags, compute: ComputeConfig) -> dict[str, Array]:
@@ -42,7 +43,7 @@ def losses(prediction: CMIGNetPrediction, batch: Batch, flags: CMIGNetFlags, com
     if loss.overlap:
         terms["overlap"] = _overlap(prediction, batch, loss, compute.rows)
     if prediction.source_scores is not None and prediction.iterations[0].match is not None:
-        terms["mask"] = mask(prediction)
+        terms["mask"] = partners(prediction, batch, loss, compute.rows) if flags.keypoints.target == "overlap" else mask(prediction)
     for i, iteration in enumerate(prediction.iterations):
         if iteration.match is None:
             terms[f"pose_{i}"] = _pose(iteration, prediction, batch)
@@ -122,9 +123,29 @@ def mask(prediction: MatchingPrediction) -> Array:
     return total
 
 
+def partners(prediction: CMIGNetPrediction, batch: Batch, flags: LossFlags, rows: int = 0) -> Array:
+    """Return the binary cross entropy of the scores of all points as logits of having a partner within `match_threshold`."""
+    scores = _present(prediction.source_scores), _present(prediction.target_scores)
+    labels = overlapping(batch, flags.match_threshold, rows)
+    entropies = [jnp.mean(optax.sigmoid_binary_cross_entropy(s, label.astype(s.dtype))) for s, label in zip(scores, labels, strict=True)]
+    return 0.5 * (entropies[0] + entropies[1])
+
+
+def overlapping(batch: Batch, threshold: float, rows: int = 0) -> tuple[Array, Array]:
+    """Return whether a point of the source, `[B, N]`, and of the target, `[B, M]`, has the other cloud closer under the true pose."""
+    moved = _present(batch.target_from_source).apply(batch.source)
+
+    def near(points: Array, others: Array) -> Array:
+        return jax.vmap(lambda x, y: nearest(x, y, rows)[1])(points, others) < threshold
+
+    return near(moved, batch.target), near(batch.target, moved)
+
+
 def matching(prediction: MatchingPrediction, iteration: Iteration, flags: LossFlags) -> Array:
     """Return the negative log-likelihood of the true correspondents under the matching matrix (L_CS)."""
     index, label = _present(prediction.keypoints.match_index), _present(prediction.keypoints.match_label)
+    if iteration.log_matching is not None:
+        return _sinkhorn_matching(iteration.log_matching, index, label)
     log_p = jax.nn.log_softmax(_present(iteration.match), axis=-1)
     chosen = jnp.take_along_axis(log_p, index[..., None], axis=-1)[..., 0]
     count = jnp.maximum(jnp.sum(label), 1) if flags.match_mean == "positive" else label.size
@@ -156,6 +177,13 @@ def _present(value: T | None) -> T:
     return value
 
 
+def _sinkhorn_matching(log_matching: Array, index: Array, label: Array) -> Array:
+    """Return the negative log-likelihood of the true correspondents, and of the slack for keypoints that have none."""
+    chosen = jnp.take_along_axis(log_matching, index[..., None], axis=-1)[..., 0]
+    slack = jnp.log(jnp.maximum(1 - jnp.sum(jnp.exp(log_matching), axis=-1), SMALLEST_SLACK))
+    return -jnp.mean(jnp.where(label > 0, chosen, slack))
+
+
 def _cross_modal(prediction: CMIGNetPrediction, flags: LossFlags, compute: ComputeConfig) -> Array:
     pooled = [maximum(x, 1, compute.kernels) for x in (prediction.source_features, prediction.target_features)]
     points = 0.5 * (pooled[0] + pooled[1])
@@ -164,9 +192,7 @@ def _cross_modal(prediction: CMIGNetPrediction, flags: LossFlags, compute: Compu
 
 
 def _overlap(prediction: CMIGNetPrediction, batch: Batch, flags: LossFlags, rows: int) -> Array:
-    moved = _present(batch.target_from_source).apply(batch.source)
-    overlaps_x = jax.vmap(lambda a, b: nearest(a, b, rows)[1])(moved, batch.target) < flags.overlap_threshold
-    overlaps_y = jax.vmap(lambda a, b: nearest(a, b, rows)[1])(batch.target, moved) < flags.overlap_threshold
+    overlaps_x, overlaps_y = overlapping(batch, flags.overlap_threshold, rows)
     active = flags.overlap_mean == "active"
     per_pair = jax.vmap(lambda f, g, x, y: overlap(f, g, x, y, flags.margins, active, rows))
     return jnp.mean(per_pair(prediction.source_features, prediction.target_features, overlaps_x, overlaps_y))

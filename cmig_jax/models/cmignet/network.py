@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+from collections.abc import Callable
 from typing import Any
 
 import chex
@@ -12,6 +13,7 @@ import jax.numpy as jnp
 from jax import Array
 
 from cmig_jax.config import ComputeConfig
+from cmig_jax.geometry.sinkhorn import log_sinkhorn
 from cmig_jax.models.cmignet.flags import CMIGNetFlags
 from cmig_jax.models.cmignet.heads import CMIGNetHead, IDAMHead, KeypointSet, Match, PCRNetHead
 from cmig_jax.models.cmignet.keypoints import (
@@ -24,6 +26,7 @@ from cmig_jax.models.cmignet.keypoints import (
 from cmig_jax.models.cmignet.prediction import CMIGNetPrediction, Iteration, Keypoints
 from cmig_jax.nn.attention import CrossAttention, PairTransformer
 from cmig_jax.nn.edgeconv import PointEncoder
+from cmig_jax.nn.local_pairs import LocalPairs
 from cmig_jax.nn.recompute import call
 from cmig_jax.nn.resnet import ViewEncoder
 from cmig_jax.ops.neighbours import top_k
@@ -33,6 +36,7 @@ from cmig_jax.structs import Batch, Correspondences
 from cmig_jax.transform import RigidTransform
 
 HIGHEST = jax.lax.Precision.HIGHEST
+SINKHORN_ROUNDS = 5
 MATCH_LIMIT = 20.0  # |M| beyond which the reference clips, so that no softmax saturates
 
 
@@ -46,6 +50,8 @@ class CMIGNet(nn.Module):
         flags, compute = self.flags, self.compute
         points, image, fusion = flags.points, flags.image, flags.fusion
         self.points = PointEncoder(points.k, points.widths, points.dim, compute)
+        if points.local == "pairs":
+            self.local = LocalPairs(points.k, points.local_widths, compute)
         if flags.needs.views:
             self.views = ViewEncoder(image.widths, image.blocks, compute)
         if fusion.points == "transformer":
@@ -69,7 +75,7 @@ class CMIGNet(nn.Module):
             ValueError: too few points, unequal clouds where the flags need equal ones, or an input that is missing.
         """
         self._check(batch, train, key, source_index)
-        source, target = self.encode(batch.source, batch.target, train)
+        source, target = self.encode(batch, train)
         tokens = self.view_tokens(batch, train)
         fused_source, fused_target = self.fuse(source, target, tokens)
         source_scores, target_scores = self.significance(fused_source, fused_target)
@@ -78,13 +84,23 @@ class CMIGNet(nn.Module):
                 keypoints = self._training_keypoints(batch, key, source_index)
             else:
                 keypoints = self._keypoints(batch, source_scores, target_scores, key)
-        iterations, pose = self.iterate(
-            gather_keypoints(batch.source, fused_source, keypoints.source_index),
-            gather_keypoints(batch.target, fused_target, keypoints.target_index),
-            train,
-        )
+
+        def sets(moved: Batch, features: tuple[Array, Array]) -> tuple[KeypointSet, KeypointSet]:
+            return (
+                gather_keypoints(moved.source, features[0], keypoints.source_index, self._overlap(source_scores)),
+                gather_keypoints(moved.target, features[1], keypoints.target_index, self._overlap(target_scores)),
+            )
+
+        def anew(pose: RigidTransform) -> tuple[KeypointSet, KeypointSet]:
+            moved = batch.moved(pose)
+            return sets(moved, self.fuse(*self.encode(moved, train), tokens))
+
+        first = sets(batch, (fused_source, fused_target))
+        iterations, pose = self.iterate(*first, train, anew if self.flags.matching.features == "anew" else None)
         return CMIGNetPrediction(
             target_from_source=pose,
+            source_overlap=self._overlap(source_scores),
+            target_overlap=self._overlap(target_scores),
             correspondences=_correspondences(keypoints, iterations[-1]),
             source_features=source,
             target_features=target,
@@ -97,15 +113,24 @@ class CMIGNet(nn.Module):
             iterations=iterations,
         )
 
-    def encode(self, source: Array, target: Array, train: bool) -> tuple[Array, Array]:
+    def encode(self, batch: Batch, train: bool) -> tuple[Array, Array]:
         """Encode both clouds, as one batch if they have equal size: `[B, N, C]`, `[B, M, C]`."""
+        source, target = batch.source, batch.target
+        local = ()
+        if self.flags.points.local == "pairs":
+            if batch.source_normals is None or batch.target_normals is None:
+                raise ValueError("model.points.local = pairs reads unit normals: expected normals of both clouds, got None")
+            local = self.local(source, batch.source_normals), self.local(target, batch.target_normals)
         if source.shape[1] != target.shape[1]:
-            source, target = self.points((source, target), train=train)
+            source, target = self.points((source, target), train=train, local=local)
             return source, target
-        # The two clouds of a pair stay together, so that each of several devices keeps its own pairs.
-        both = jnp.stack([source, target], axis=1)
-        (both_features,) = self.points((both.reshape(-1, *source.shape[1:]),), train=train)
-        features = both_features.reshape(*both.shape[:-1], -1)
+
+        def joint(first: Array, second: Array) -> Array:
+            """Put the two clouds of a pair beside each other, so that each of several devices keeps its own pairs."""
+            return jnp.stack([first, second], axis=1).reshape(-1, *first.shape[1:])
+
+        (both,) = self.points((joint(source, target),), train=train, local=(joint(*local),) if local else ())
+        features = both.reshape(-1, 2, *both.shape[1:])
         return features[:, 0], features[:, 1]
 
     def view_tokens(self, batch: Batch, train: bool) -> Array | None:
@@ -137,11 +162,19 @@ class CMIGNet(nn.Module):
         of_source, of_target = self.score(source, pooled_target), self.score(target, pooled_source)
         return (of_target, of_source) if self.flags.keypoints.score_from == "other" else (of_source, of_target)
 
-    def iterate(self, source: KeypointSet, target: KeypointSet, train: bool) -> tuple[tuple[Iteration, ...], RigidTransform]:
-        """Match, solve, move the source, n times (Sec. III-E)."""
+    def iterate(
+        self,
+        source: KeypointSet,
+        target: KeypointSet,
+        train: bool,
+        anew: Callable[[RigidTransform], tuple[KeypointSet, KeypointSet]] | None = None,
+    ) -> tuple[tuple[Iteration, ...], RigidTransform]:
+        """Match, solve, move the source, n times (Sec. III-E); `anew` returns the keypoints with the features of the moved source."""
         pose = RigidTransform.identity((source.points.shape[0],), source.points.dtype)
         iterations = []
-        for head in self.heads + (() if train else self.heads[-1:] * self.flags.matching.repeats):
+        for i, head in enumerate(self.heads + (() if train else self.heads[-1:] * self.flags.matching.repeats)):
+            if anew is not None and 0 < i < len(self.heads):
+                source, target = anew(pose)
             if isinstance(head, PCRNetHead):
                 iteration = Iteration(source=source.points, step=head(source, target))
             else:
@@ -175,6 +208,9 @@ class CMIGNet(nn.Module):
     def _call(self, module: nn.Module, *inputs: Any, **options: Any) -> Any:
         return call(module, *inputs, recompute=self.compute.recompute, **options)
 
+    def _overlap(self, scores: Array | None) -> Array | None:
+        return nn.sigmoid(scores) if scores is not None and self.flags.keypoints.target == "overlap" else None
+
     def _keypoints(self, batch: Batch, source_scores: Array | None, target_scores: Array | None, key: Array | None) -> Keypoints:
         (B, N, _), M = batch.source.shape, batch.target.shape[1]
         flags = self.flags.keypoints
@@ -205,11 +241,18 @@ class CMIGNet(nn.Module):
         total = match.feature if match.coordinate is None else match.feature + match.coordinate
         total = jnp.clip(total, -MATCH_LIMIT, MATCH_LIMIT)
         correspondence = jnp.argmax(total, axis=-1)
-        if self.flags.matching.correspondence == "soft":
+        score, log_matching = nn.sigmoid(match.logit), None
+        if self.flags.matching.correspondence == "hard":
+            corresponding = jnp.take_along_axis(target.points, correspondence[..., None], axis=1)
+        elif self.flags.matching.correspondence == "soft":
             corresponding = jnp.matmul(nn.softmax(total, axis=-1), target.points, precision=HIGHEST)
         else:
-            corresponding = jnp.take_along_axis(target.points, correspondence[..., None], axis=1)
-        weight = credible_half(nn.sigmoid(match.logit))
+            log_matching = log_sinkhorn(total, SINKHORN_ROUNDS)
+            corresponding = jnp.matmul(nn.softmax(log_matching, axis=-1), target.points, precision=HIGHEST)
+            score *= jnp.sum(jnp.exp(log_matching), axis=-1)
+        if source.overlap is not None:
+            score *= source.overlap
+        weight = credible_half(score)
         step = weighted_procrustes(source.points, corresponding, weight, self.flags.pose.centroid, self.compute.kernels)
         if self.flags.pose.gradient == "stopped":
             step = jax.lax.stop_gradient(step)
@@ -219,6 +262,7 @@ class CMIGNet(nn.Module):
             feature_match=match.feature,
             coordinate_match=match.coordinate,
             match=total,
+            log_matching=log_matching,
             logit=match.logit,
             weight=weight,
             correspondence=correspondence,
@@ -234,10 +278,10 @@ def credible_half(score: Array) -> Array:
     return weight / (jnp.sum(weight, axis=-1, keepdims=True) + 1e-8)
 
 
-def gather_keypoints(points: Array, features: Array, index: Array) -> KeypointSet:
-    """Select keypoints `[B, K]` of points `[B, N, 3]` and features `[B, N, C]`."""
+def gather_keypoints(points: Array, features: Array, index: Array, overlap: Array | None = None) -> KeypointSet:
+    """Select keypoints `[B, K]` of points `[B, N, 3]`, features `[B, N, C]` and overlap scores `[B, N]`."""
     take = jax.vmap(lambda x, i: x[i])
-    return KeypointSet(points=take(points, index), features=take(features, index))
+    return KeypointSet(take(points, index), take(features, index), None if overlap is None else take(overlap, index))
 
 
 def _correspondences(keypoints: Keypoints, last: Iteration) -> Correspondences | None:

@@ -36,6 +36,7 @@ class Iteration:
         feature_match: `[B, K, K]` M_F, rows source keypoints, columns target keypoints (None for the pcrnet head).
         coordinate_match: `[B, K, K]` M_P (None for the idam and pcrnet heads).
         match: `[B, K, K]` matching matrix M before its softmax, clipped (None for pcrnet).
+        log_matching: `[B, K, K]` logarithm of the matching by Sinkhorn's normalisation (None for others).
         logit: `[B, K]` matching score s before its sigmoid (None for pcrnet).
         weight: `[B, K]` w of Eq. 10, which sum to 1 (None for pcrnet).
         correspondence: `[B, K]` index of the target keypoint matched to each source keypoint (None for pcrnet).
@@ -47,6 +48,7 @@ class Iteration:
     feature_match: Array | None = None
     coordinate_match: Array | None = None
     match: Array | None = None
+    log_matching: Array | None = None
     logit: Array | None = None
     weight: Array | None = None
     correspondence: Array | None = None

@@ -9,7 +9,7 @@ from scipy.special import log_softmax
 
 from cmig_jax.config import ComputeConfig
 from cmig_jax.models.cmignet import losses as functions
-from cmig_jax.models.cmignet.flags import CMIGNetFlags, LossFlags
+from cmig_jax.models.cmignet.flags import CMIGNetFlags, KeypointsFlags, LossFlags
 from cmig_jax.models.cmignet.losses import credibility, cross_modal, mask, matching, overlap
 from cmig_jax.models.cmignet.prediction import CMIGNetPrediction, Iteration, Keypoints
 from cmig_jax.structs import Batch
@@ -175,6 +175,41 @@ def test_matching_without_a_positive_label_is_zero_with_a_finite_gradient(mean):
     loss, gradient = jax.jit(jax.value_and_grad(value))(prediction.iterations[0].match)
     assert loss == 0
     np.testing.assert_array_equal(gradient, 0)
+
+
+def test_a_normalised_matching_is_the_likelihood_of_partners_and_of_having_none():
+    prediction, _ = case()
+    rng, label = np.random.default_rng(4), prediction.keypoints.match_label
+    probabilities = rng.dirichlet(np.ones(K + 1), (B, K))  # the last one: no partner
+    iteration = prediction.iterations[0].replace(log_matching=np.log(probabilities[..., :-1]))
+    expected = -np.log(np.where(label > 0, np.diagonal(probabilities[..., :-1], axis1=1, axis2=2), probabilities[..., -1])).mean()
+    np.testing.assert_allclose(matching(prediction, iteration, LossFlags()), expected, rtol=1e-9)
+
+
+def test_a_matching_without_slack_left_has_a_finite_loss_and_gradient():
+    prediction, _ = case(label=0.0)
+    sure = np.log(np.full((B, K, K), 1 / K))
+
+    def loss(log_matching):
+        return matching(prediction, prediction.iterations[0].replace(log_matching=log_matching), LossFlags())
+
+    value, gradient = jax.value_and_grad(loss)(sure)
+    assert 10 < value < 20
+    assert np.isfinite(gradient).all()
+
+
+def test_overlap_scores_learn_which_points_have_a_partner():
+    prediction, batch = case()
+    flags = CMIGNetFlags(keypoints=KeypointsFlags(target="overlap"), loss=LossFlags(overlap=False, cross_modal="off"))
+    moved = batch.source @ batch.target_from_source.R.swapaxes(1, 2) + batch.target_from_source.t[:, None]
+    gaps = np.linalg.norm(moved[:, :, None] - batch.target[:, None], axis=-1)
+    expected = 0.0
+    for scores, axis in ((prediction.source_scores, 2), (prediction.target_scores, 1)):
+        partner = gaps.min(axis=axis) < 0.05
+        assert partner.sum() == 5 * B
+        expected += 0.5 * np.mean(np.logaddexp(0, np.where(partner, -scores, scores)))
+    terms = functions.losses(prediction, batch, flags, ComputeConfig())
+    np.testing.assert_allclose(terms["mask"], expected, rtol=1e-9)
 
 
 @pytest.mark.parametrize(("kind", "threshold"), [("index", 0.05), ("distance", 0.05), ("distance", 0.1)])

@@ -1,5 +1,7 @@
 """The network as a function: what its results depend on, and the parts of a prediction."""
 
+import dataclasses
+
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -118,6 +120,64 @@ def test_correspondents_are_the_best_or_the_mean_under_the_softmax_of_the_clippe
     np.testing.assert_allclose(found.weight, credible_half(1 / (1 + np.exp(-match.logit))), atol=1e-12)
     pose = weighted_procrustes(source.points, found.corresponding, found.weight)
     assert_same(found.step, pose)
+
+
+def test_sinkhorn_s_matching_gives_partners_by_its_rows_and_weights_by_their_sums(tiny_flags, x64):
+    rng = np.random.default_rng(0)
+    source, target = (KeypointSet(points=rng.normal(size=(2, n, 3)), features=None) for n in (7, 9))
+    feature = 3 * rng.normal(size=(2, 7, 9))
+    feature[:, 2] = -15  # a keypoint that is like none of the others
+    match = Match(feature=feature, coordinate=np.zeros((2, 7, 9)), logit=np.full((2, 7), 2.0))
+    found = CMIGNet(tiny_flags(matching={"correspondence": "sinkhorn"}))._solve(match, source, target)
+    matching = np.exp(np.pad(feature, ((0, 0), (0, 1), (0, 1))))  # with the slack, plainly
+    for _ in range(5):
+        matching[:, :-1] /= matching[:, :-1].sum(axis=2, keepdims=True)
+        matching[:, :, :-1] /= matching[:, :, :-1].sum(axis=1, keepdims=True)
+    matching = matching[:, :-1, :-1]
+    np.testing.assert_allclose(np.exp(found.log_matching), matching, atol=1e-12)
+    np.testing.assert_allclose(found.corresponding, matching / matching.sum(-1, keepdims=True) @ target.points, atol=1e-12)
+    np.testing.assert_allclose(found.weight, credible_half(matching.sum(-1) / (1 + np.exp(-2.0))), atol=1e-12)
+    assert np.all(np.asarray(found.weight)[:, 2] == 0)
+
+
+def test_an_overlap_score_weighs_the_correspondence_of_its_keypoint(tiny_flags, x64):
+    rng = np.random.default_rng(0)
+    overlap = rng.uniform(size=(2, 7))
+    source = KeypointSet(points=rng.normal(size=(2, 7, 3)), features=None, overlap=overlap)
+    target = KeypointSet(points=rng.normal(size=(2, 9, 3)), features=None)
+    match = Match(feature=rng.normal(size=(2, 7, 9)), coordinate=None, logit=rng.normal(size=(2, 7)))
+    found = CMIGNet(tiny_flags())._solve(match, source, target)
+    np.testing.assert_allclose(found.weight, credible_half(overlap / (1 + np.exp(-match.logit))), atol=1e-12)
+
+
+def test_overlap_scores_are_returned_and_used_as_probabilities(tiny_flags, pairs, random_variables, x64):
+    batch = pairs(20, 24).replace(views=None)
+    net = CMIGNet(tiny_flags(fusion={"image": "none"}, keypoints={"target": "overlap", "count": 12}))
+    found = evaluate(net, random_variables(net, batch, train=False), batch)
+    for scores, overlap in ((found.source_scores, found.source_overlap), (found.target_scores, found.target_overlap)):
+        np.testing.assert_allclose(overlap, 1 / (1 + np.exp(-np.asarray(scores))), atol=1e-12)
+    first = found.iterations[0]
+    of_keypoints = np.take_along_axis(np.asarray(found.source_overlap), np.asarray(found.keypoints.source_index), 1)
+    np.testing.assert_allclose(first.weight, credible_half(of_keypoints / (1 + np.exp(-np.asarray(first.logit)))), atol=1e-12)
+
+
+@pytest.mark.parametrize("local", ["none", "pairs"])
+def test_features_anew_are_those_of_the_source_as_it_was_moved(local, tiny_flags, pairs, random_variables, x64):
+    flags = tiny_flags(fusion={"image": "none"}, keypoints={"select": "all"}, points={"local": local, "local_widths": (8,)})
+    batch = pairs(20, 24).replace(views=None)
+    unit = [x / np.linalg.norm(x, axis=-1, keepdims=True) for x in (batch.source, batch.target)]
+    batch = batch.replace(source_normals=unit[0], target_normals=unit[1])
+    anew = CMIGNet(dataclasses.replace(flags, matching=dataclasses.replace(flags.matching, features="anew")))
+    variables = random_variables(anew, batch, train=False)
+    found, once = evaluate(anew, variables, batch), evaluate(CMIGNet(flags), variables, batch)
+    assert_same(found.iterations[0], once.iterations[0])
+    first = found.iterations[0].step
+    # The second round alone: the network whose first round has the weights of the second, on the moved source.
+    swapped = {kind: {**x, "heads_0": x["heads_1"]} if "heads_1" in x else x for kind, x in variables.items()}
+    second = evaluate(CMIGNet(flags), swapped, batch.moved(first))
+    assert_same(second.iterations[0].match, found.iterations[1].match)
+    assert_same(second.iterations[0].step, found.iterations[1].step)
+    assert np.abs(found.iterations[1].match - once.iterations[1].match).max() > 1e-3
 
 
 def test_keypoints_are_the_points_of_highest_score(prediction):

@@ -33,6 +33,11 @@ VARIANTS = {
     "all": {"keypoints": {"select": "all"}},
     "all in rows": {"keypoints": {"select": "all"}, "compute": ComputeConfig(rows=13)},
     "soft": {"matching": {"correspondence": "soft"}},
+    "Sinkhorn": {"matching": {"correspondence": "sinkhorn"}},
+    "features anew": {"matching": {"features": "anew"}},
+    "overlap scores": {"keypoints": {"target": "overlap"}},
+    "point pairs": {"points": {"local": "pairs", "local_widths": (8,)}},
+    "point pairs anew": {"points": {"local": "pairs", "local_widths": (8,)}, "matching": {"features": "anew"}},
     "through": {"pose": {"gradient": "through"}},
     "bfloat16": {"compute": BFLOAT16, "fusion": {"image": "views"}},
     "bfloat16 idam": {"compute": BFLOAT16, "matching": {"head": "idam"}, "fusion": {"image": "transformer"}},
@@ -45,6 +50,8 @@ def test_every_variant_trains_and_evaluates_in_float32(name, tiny_flags, pairs):
     groups = dict(VARIANTS[name])
     compute, flags = groups.pop("compute", ComputeConfig()), tiny_flags(**groups)
     net, batch = CMIGNet(flags, compute), pairs(60, 60 if flags.needs.equal_sizes else 50, sets=2, dtype=np.float32)
+    if flags.needs.normals:
+        batch = batch.replace(source_normals=batch.source, target_normals=batch.target)
     variables, trained = traced(net, batch, True)
     evaluated = jax.eval_shape(lambda v: net.apply(v, batch, train=False), variables)
     K = [60, 50] if flags.keypoints.select == "all" else [32, 32]

@@ -15,11 +15,12 @@ from flax import traverse_util
 
 from cmig_jax.config import Config
 from cmig_jax.config_json import to_json
-from cmig_jax.files import DAMAGED, replacing
+from cmig_jax.files import DAMAGED, replacing, sha256
 from cmig_jax.models.networks import config_from_json
 
 PRETRAINED = Path(__file__).parents[1] / "pretrained" / "own-clouds.npz"
 """The network that comes with the package: the preset `own-clouds`, trained on generated objects alone."""
+PRETRAINED_SHA256 = "a8eb3a3bdbf9ea953e74e64fe6fcff7015d784b410ee75c7a8caa87bd422aa56"
 SUFFIX = ".npz"
 CONFIG, STEP = "config.json", "step"
 
@@ -53,8 +54,10 @@ def read_weights(path: Path) -> tuple[Config, int, dict[str, Any]]:
     """Read a weights file: the config, the training steps, and the variables in float32.
 
     Raises:
-        ValueError: not a weights file, or damaged; the message names it.
+        ValueError: not a weights file, or damaged, or in the package's place another than it came with; the message names it.
     """
+    if path == PRETRAINED and path.exists() and (found := sha256(path)) != PRETRAINED_SHA256:
+        raise ValueError(f"{path}: SHA-256 {found}; expected {PRETRAINED_SHA256}, the file that comes with the package: install it again")
     try:
         with path.open("rb") as file, np.load(file, allow_pickle=False) as archive:
             config = config_from_json(str(archive[CONFIG]))

@@ -12,6 +12,7 @@ from scipy.spatial.transform import Rotation
 from cmig_jax import load, register
 from cmig_jax.data.generated import make_object
 from cmig_jax.data.sample import sample_surface
+from cmig_jax.inference import weights_file
 from cmig_jax.inference.weights_file import PRETRAINED, check_variables, read_weights, write_weights
 from configs import PRESETS
 
@@ -83,6 +84,15 @@ def test_the_packaged_weights_are_of_the_present_layout() -> None:
     """An older file would be read too, through `models.networks`; the packaged one needs no such help."""
     with np.load(PRETRAINED) as file:
         assert json.loads(str(file["config.json"]))["network"] == read_weights(PRETRAINED)[0].model.network
+
+
+def test_another_file_in_the_place_of_the_packaged_one_is_refused(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    config, step, variables = read_weights(PRETRAINED)
+    write_weights(tmp_path / "own-clouds.npz", config, step + 1, variables)
+    assert read_weights(tmp_path / "own-clouds.npz")[1] == step + 1
+    monkeypatch.setattr(weights_file, "PRETRAINED", tmp_path / "own-clouds.npz")
+    with pytest.raises(ValueError, match=r"own-clouds\.npz: SHA-256 .*expected a8eb3a3b.*install it again"):
+        read_weights(tmp_path / "own-clouds.npz")
 
 
 def test_export_names_what_is_wrong(main, tmp_path: Path) -> None:

@@ -32,13 +32,14 @@ METHODS = {
     "OMNet": "omnet",
     "FINet": "finet",
     "RPM-Net": "rpmnet",
+    "RPM-Net, observed normals": "rpmnet",
     "PCRNet": "pcrnet",
     "MaskNet, then ICP": "masknet",
 }
 """The preset of each method, by its name in a table."""
 
-FLAGS: dict[str, Flags] = {"MaskNet, then ICP": {"model.share": 0.75}}
-"""What a method changes in these tables: there both clouds have the same number of points, of which MaskNet would leave out none."""
+FLAGS: dict[str, Flags] = {"RPM-Net, observed normals": {"data.normals": "observed"}, "MaskNet, then ICP": {"model.share": 0.75}}
+"""What a row changes: normals as a sensor's cloud gives them, and MaskNet's choice, which would leave out none of equally many points."""
 
 QUOTED: dict[str, dict[str, Quoted]] = {
     "table1": {

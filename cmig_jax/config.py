@@ -29,6 +29,7 @@ Normals = Literal["object", "observed"]
 Layout = Literal["dodecahedron", "ring", "axes"]
 Rule = tuple[str, bool, str]
 """A flag and its value, whether it is valid, and what was expected."""
+LEAST_SHARE = 0.1  # that a crop of its own may leave of a cloud
 
 
 class FlagError(ValueError):
@@ -84,7 +85,8 @@ class DataConfig:
     keep: float = 0.75
     """Share of the points that the crop keeps (Sec. IV-B removes 25 %)."""
     keep_least: float = 0.0
-    """Above 0, the share of each pair is drawn from [this, keep], of so many more points that as many are left as with `keep`."""
+    """Above 0, the share of each pair is drawn from [this, keep], of so many more points that as many are left as with `keep`; an object
+    needs points * keep / keep_least of them (twice as many with `sampling=twice`)."""
     crop: Crop = "shared"
     """Crop around one far point for both clouds, one far point each (lower overlap), a random half-space each (RPM-Net), a far point for
     the source alone with a complete target (`source`: MaskNet), or no crop."""
@@ -116,10 +118,11 @@ class DataConfig:
     validation: float = 0.1
     """Share of the training objects held out to choose the checkpoint; the test split is never used for that."""
     tested: Tested = "test"
-    """Objects that are evaluated on: those of the test file, or the training objects that `validation` holds out. A network, a flag or a
-    constant is chosen on the latter."""
+    """Objects that are evaluated on: those of the test file, or the training objects that `validation` holds out (with the
+    training's source, categories, `validation` and `test_seed`). Whatever is chosen is chosen on the latter; a run's checkpoint was."""
     test_seed: int = 1234
-    """Seed of the validation and test pairs: a pair is a function of this seed and its object."""
+    """Seed of the validation and test pairs, and of the poses with `pose_of=each-object`: a pair is a function of this seed and its
+    object."""
     workers: int = 0
     """Loader processes; 0 makes pairs in threads of the training process."""
 
@@ -128,7 +131,11 @@ class DataConfig:
             [
                 (f"data.points = {self.points}", self.points >= 1, "at least 1"),
                 (f"data.keep = {self.keep}", 0 < self.keep <= 1, "a share in (0, 1]"),
-                (f"data.keep_least = {self.keep_least}", 0 <= self.keep_least <= self.keep, f"0, or a share of at most keep = {self.keep}"),
+                (
+                    f"data.keep_least = {self.keep_least}",
+                    self.keep_least == 0 or LEAST_SHARE <= self.keep_least <= self.keep,
+                    f"0, or a share from {LEAST_SHARE} to data.keep = {self.keep}",
+                ),
                 (
                     f"data.keep_least = {self.keep_least} with data.crop = {self.crop}",
                     self.keep_least == 0 or self.crop in ("shared", "independent", "half-space"),

@@ -7,9 +7,6 @@ source coordinates to target coordinates, `x_target = R x_source + t`.
 
 from __future__ import annotations
 
-import dataclasses
-
-import jax.numpy as jnp
 from flax import struct
 from jax import Array
 
@@ -36,11 +33,6 @@ class Batch:
     target_from_source: RigidTransform | None = None
     source_normals: Array | None = None
     target_normals: Array | None = None
-
-    def moved(self, pose: RigidTransform) -> Batch:
-        """Return the pairs with the source, and its normals, moved by `pose [B]`; views and true pose stay those of the source as given."""
-        normals = None if self.source_normals is None else RigidTransform(pose.R, jnp.zeros_like(pose.t)).apply(self.source_normals)
-        return dataclasses.replace(self, source=pose.apply(self.source), source_normals=normals)
 
 
 @struct.dataclass

@@ -40,9 +40,15 @@ def at_toy_scale(config: Config) -> Config:
     )
 
 
+def shortened(config: Config) -> Config:
+    """Train for a fifth of the epochs and change nothing else: of the small presets, minutes on two cores."""
+    return replace(config, optim=replace(config.optim, epochs=max(1, config.optim.epochs // 5)))
+
+
 SCALES: dict[str, Callable[[Config], Config]] = {
     "full": lambda config: config,
     "cpu": at_cpu_scale,
     "cpu-long": at_long_cpu_scale,
+    "short": shortened,
     "toy": at_toy_scale,
 }

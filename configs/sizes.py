@@ -45,12 +45,14 @@ def _cmignet(
 
 
 def _cpu_cmignet(flags: CMIGNetFlags) -> CMIGNetFlags:
-    points, image = PointsFlags(k=12, widths=(32, 32, 64, 64), dim=128), ImageFlags(widths=(16, 32, 64, 128), blocks=(1, 1, 1, 1))
+    points = replace(flags.points, k=12, widths=(32, 32, 64, 64), dim=128)
+    image = ImageFlags(widths=(16, 32, 64, 128), blocks=(1, 1, 1, 1))
     return _cmignet(flags, points, image, 256, 48, 144, feature_widths=(64, 32, 32))
 
 
 def _toy_cmignet(flags: CMIGNetFlags) -> CMIGNetFlags:
-    points, image = PointsFlags(k=4, widths=(4, 4), dim=8), ImageFlags(widths=(4, 8), blocks=(1, 1))
+    points = replace(flags.points, k=4, widths=(4, 4), dim=8, local_widths=(8,))
+    image = ImageFlags(widths=(4, 8), blocks=(1, 1))
     small = _cmignet(flags, points, image, 8, 8, 24, feature_widths=(4, 4), coordinate_widths=(4,))
     return replace(small, fusion=replace(small.fusion, heads=2))
 

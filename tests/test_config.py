@@ -20,7 +20,7 @@ REFUSED_BY_GROUP = [
     ("", {"name": ["", "../elsewhere", "/anywhere"], "seed": [-1]}),
     ("data.", {"points": [0], "keep": [0.0, 1.5, -0.1], "validation": [0.0, 1.0], "shapes": [3], "test_seed": [-1], "workers": [-1]}),
     ("data.", {"noise_std": [-0.01, math.inf], "noise_clip": [-0.05], "max_angle_deg": [-1.0, 181.0], "max_translation": [-0.5, math.inf]}),
-    ("data.", {"max_twist": [-0.1, math.inf], "keep_least": [-0.1, 0.8]}),
+    ("data.", {"max_twist": [-0.1, math.inf], "keep_least": [-0.1, 0.01, 0.8]}),
     ("views.", {"count": [12, 0], "size": [7]}),
     ("model.points.", {"k": [0], "widths": [(), (64, 0)], "dim": [2], "local_widths": [(), (12,)]}),
     ("model.image.", {"widths": [(64, 128, 256, 511)], "blocks": [(2, 2, 2)]}),
@@ -96,7 +96,13 @@ def test_every_rule_is_tested_above(monkeypatch):
     for module in (cmig_jax.config, cmignet):
         monkeypatch.setattr(module, "check", lambda rules: ruled.update(name.split(" = ")[0] for name, _, _ in rules))
     Config(name="paper", model=cmignet.CMIGNetFlags())
-    assert ruled == set(REFUSED) | {"model.fusion.image", "data.crop", "model.keypoints.target"}
+    apart = {
+        "model.fusion.image",
+        "data.crop",
+        "model.matching.head",
+        *(f"model.keypoints.{x}" for x in ("select", "activation", "score_from")),
+    }
+    assert ruled == set(REFUSED) | apart
 
 
 def test_tied_image_fusion_needs_the_transformer_whose_weights_it_shares():
@@ -104,10 +110,17 @@ def test_tied_image_fusion_needs_the_transformer_whose_weights_it_shares():
         changed(PAPER, "model.fusion", cmignet.FusionFlags(points="none", image="transformer"))
 
 
-def test_overlap_scores_are_predicted_logits():
-    for keypoints in ({"select": "random"}, {"activation": "sigmoid"}):
-        with pytest.raises(ValueError, match=r"model\.keypoints\.target = overlap, .*: expected model\.keypoints\.select = predicted"):
-            changed(PAPER, "model.keypoints", cmignet.KeypointsFlags(target="overlap", **keypoints))
+@pytest.mark.parametrize(("flag", "value"), [("select", "random"), ("activation", "sigmoid"), ("score_from", "other")])
+def test_overlap_scores_are_predicted_logits_of_the_cloud_s_own_points(flag, value):
+    with pytest.raises(ValueError, match=rf"model\.keypoints\.{flag} = {value} with model\.keypoints\.target = overlap: expected"):
+        changed(PAPER, "model.keypoints", cmignet.KeypointsFlags(target="overlap", **{flag: value}))
+
+
+@pytest.mark.parametrize(("group", "flag", "value"), [("keypoints", "target", "overlap"), ("matching", "correspondence", "sinkhorn")])
+def test_a_regressed_pose_has_no_matching_to_change(group, flag, value):
+    regressed = dataclasses.replace(PAPER.model, matching=cmignet.MatchingFlags(head="pcrnet"))
+    with pytest.raises(ValueError, match=rf"model\.matching\.head = pcrnet with .*{flag} = {value}.*: expected another head"):
+        dataclasses.replace(regressed, **{group: dataclasses.replace(getattr(regressed, group), **{flag: value})})
 
 
 def test_a_share_is_drawn_for_crops_of_both_clouds():

@@ -18,7 +18,7 @@ from cmig_jax.experiments.schema import Catalogue
 
 @dataclass(frozen=True)
 class Command:
-    """Evaluate a network on the test split of its data beside methods without learning; write results, tables and pictures."""
+    """Evaluate a network on test pairs beside methods without learning; write results, tables and pictures."""
 
     data: DataConfig
     """Test data; by default as in training."""

@@ -39,8 +39,8 @@ class Run:
     sevenscenes: str | None = None
     """Folder of 7-Scenes (`table5`, `fragments`)."""
     scale: str = "full"
-    """`full`: the paper's size, for an accelerator; `cpu`: the same comparisons for two cores; `cpu-long`: those on ten times the pairs;
-    `toy`: a test of the machinery."""
+    """`full`: presets as they are, the paper's size for an accelerator; `short`: those for a fifth of the epochs; `cpu`: the same
+    comparisons for two cores; `cpu-long`: those on ten times the pairs; `toy`: a test of the machinery."""
     seeds: tuple[int, ...] = (0,)
     """Seeds of the trainings; the table shows mean and standard deviation."""
     runs: Path = Path("runs/experiments")

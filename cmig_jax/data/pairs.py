@@ -95,7 +95,8 @@ def make_pair(objects: Shards, index: int, data: DataConfig, rng: np.random.Gene
     """
     points = objects.points(index)
     rows = np.concatenate([points, objects.normals(index)], axis=1) if normals and data.normals == "object" else points
-    poses = seeded(data.test_seed, objects.names[index]) if data.pose_of == "each-object" else rng
+    # Not the generator of the validation pair, which would draw the same numbers for something else.
+    poses = seeded(data.test_seed, f"pose: {objects.names[index]}") if data.pose_of == "each-object" else rng
     clouds = make_clouds(rows, data, f"object {objects.names[index]}", rng, poses)
     if normals and data.normals == "observed":
         clouds |= {f"{cloud}_normals": observed_normals(clouds[cloud]) for cloud in ("source", "target")}

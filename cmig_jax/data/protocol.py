@@ -76,7 +76,7 @@ def samplings(points: np.ndarray, count: int, sampling: Sampling, name: object, 
     """
     needed = 2 * count if sampling == "twice" else count
     if len(points) < needed:
-        raise ValueError(f"{name} has {len(points)} points: expected at least {needed} for data.points={count}, sampling={sampling}")
+        raise ValueError(f"{name} has {len(points)} points: expected at least {needed} for {count} in a cloud and data.sampling={sampling}")
     if sampling == "subsets":
         first, second = (rng.choice(len(points), count, replace=False) for _ in range(2))
         return points[first], points[second]

@@ -123,9 +123,9 @@ class Shards:
 def settings_of(data: DataConfig, views: ViewsConfig) -> dict[str, Any]:
     """Return the settings that prepared arrays depend on, by the names of their flags.
 
-    At least 1,024 points are prepared, so that all smaller values of `data.points` share a folder.
+    At least 1,024 points are prepared, so that all smaller values of `data.points` share a folder; more where `data.keep_least` needs them.
     """
-    settings: dict[str, Any] = {"data.source": data.source, "data.points": max(1024, data.points)}
+    settings: dict[str, Any] = {"data.source": data.source, "data.points": max(1024, data.most_points)}
     if data.root is not None:
         settings["data.root"] = str(Path(data.root).expanduser().resolve())
     settings |= {f"data.{flag}": getattr(data, flag) for flag in source_of(data).flags}
@@ -146,9 +146,9 @@ def check_settings(folder: Path, data: DataConfig, views: ViewsConfig) -> None:
     """
     manifest = read_manifest(folder)
     made, wanted = manifest["settings"], settings_of(data, views)
-    per_object = data.points * (2 if data.sampling == "twice" else 1)
+    per_object = data.most_points * (2 if data.sampling == "twice" else 1)
     if manifest["distinct"] < per_object:
-        detail = f"data.points = {data.points} with data.sampling = {data.sampling}"
+        detail = f"{_points(data)} with data.sampling = {data.sampling}"
         raise ValueError(f"{detail} needs {per_object} points of every object, but {folder} has objects of {manifest['distinct']}")
     names = ["data.source", *(f"data.{flag}" for flag in source_of(data).flags)]
     if views.of == "object":
@@ -159,6 +159,11 @@ def check_settings(folder: Path, data: DataConfig, views: ViewsConfig) -> None:
                 f"{name} = {wanted.get(name)}, but {folder} was prepared with {name} = {made.get(name)}: "
                 "name another folder (data.prepared), or change the flag"
             )
+
+
+def _points(data: DataConfig) -> str:
+    drawn = f" and data.keep_least = {data.keep_least}, so up to {data.most_points} points," if data.keep_least else ""
+    return f"data.points = {data.points}{drawn}"
 
 
 def repair_command(settings: Mapping[str, Any], folder: Path) -> str:

@@ -19,7 +19,8 @@ def pairs_to_test(config: Config, limit: int | None = None) -> Pairs | RecordedP
         limit: how many of them, evenly spaced; None: all.
 
     Raises:
-        ValueError: there is no test object, or fewer points per cloud than the network needs.
+        ValueError: there is no test object, fewer than two training objects to hold some out, recorded pairs with `data.tested =
+            validation`, or fewer points per cloud than the network needs.
     """
     data, needs = config.data, config.model.needs
     if data.cropped_points < needs.points:
@@ -27,6 +28,8 @@ def pairs_to_test(config: Config, limit: int | None = None) -> Pairs | RecordedP
         raise ValueError(f"{left}: expected at least {needs.points}, which the network needs")
     views = config.views if needs.views else None
     if source_of(data).records:
+        if data.tested == "validation":
+            raise ValueError(f"data.tested = validation with data.source = {data.source}: recorded pairs hold none out; expected test")
         return RecordedPairs(ensure_recordings(data), data, views, limit, normals=needs.normals)
     folder = ensure_prepared(data, views_to_prepare(config))
     if data.tested == "validation":

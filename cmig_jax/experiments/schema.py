@@ -53,7 +53,7 @@ class Experiment:
         protocol: data flags of all its rows.
         rows: the rows.
         baselines: whether methods without learning stand beside the rows.
-        columns: metrics to show, of `evaluation.tables`.
+        columns: metrics that its table shows, keys of columns of `evaluation.tables`.
     """
 
     about: str

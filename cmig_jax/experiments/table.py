@@ -23,7 +23,8 @@ def table(experiment: Experiment, results: Results, style: str = "text") -> str:
         results: of its jobs.
         style: `text` for a terminal, `markdown`, or `latex` (package booktabs).
     """
-    shown = [column for column in (*COLUMNS, *WIDER) if column.key in experiment.columns]
+    known = {column.key: column for column in (*COLUMNS, *WIDER)}
+    shown = [known[key] for key in experiment.columns]
     rows = [[name, "", *(_cell(column, [metrics]) for column in shown)] for name, metrics in results.baselines.items()]
     rows += [_row(row, [o for o in results.outcomes if o.job.row is row], shown) for row in experiment.rows]
     quoted = any(row.quoted for row in experiment.rows)

@@ -21,6 +21,11 @@ def log_sinkhorn(affinity: Array, rounds: int) -> Array:
     Returns:
         Logarithms `[..., N, M]` of the matching, without the slack. After the last round the columns with their slack sum to 1.
     """
+    return log_sinkhorn_with_slack(affinity, rounds)[0]
+
+
+def log_sinkhorn_with_slack(affinity: Array, rounds: int) -> tuple[Array, Array]:
+    """Return `log_sinkhorn` and the logarithm of the slack column, `[..., N]`: how much of each row's point has no partner."""
 
     def one_round(_: Array, slack: tuple[Array, Array]) -> tuple[Array, Array]:
         u = _with_slack(affinity - slack[1][..., None, :], axis=-1)
@@ -28,7 +33,7 @@ def log_sinkhorn(affinity: Array, rounds: int) -> Array:
 
     start = jnp.zeros_like(affinity[..., 0]), jnp.zeros_like(affinity[..., 0, :])
     u, v = jax.lax.fori_loop(0, rounds, one_round, start)
-    return affinity - u[..., None] - v[..., None, :]
+    return affinity - u[..., None] - v[..., None, :], -u
 
 
 def _with_slack(logarithms: Array, axis: int) -> Array:

@@ -13,8 +13,6 @@ from cmig_jax.ops.edges import gather
 from cmig_jax.ops.neighbours import knn
 from cmig_jax.ops.pooling import maximum
 
-GROUPS = 8
-
 
 class LocalPairs(nn.Module):
     """Shared layers on the point-pair features of each neighbour, and their maximum over the neighbours (after RPM-Net, Sec. 5.1).
@@ -23,11 +21,13 @@ class LocalPairs(nn.Module):
 
     Attributes:
         k: neighbours, the point itself included.
-        widths: channels of the layers, multiples of 8.
+        widths: channels of the layers, multiples of `groups`.
+        groups: of the normalisation, whose statistics are those of the whole cloud.
     """
 
     k: int
     widths: tuple[int, ...]
+    groups: int = 8
     compute: ComputeConfig = ComputeConfig()
 
     @nn.compact
@@ -38,5 +38,5 @@ class LocalPairs(nn.Module):
         own = jnp.broadcast_to(normals[:, :, None], offset.shape)
         angles, length = jnp.split(point_pair_features(offset, own, gather(normals, index)), [3], axis=-1)
         pair = jnp.concatenate([jnp.minimum(angles, jnp.pi - angles), length], axis=-1)
-        layers = NormedMLP(self.widths, self.compute, use_bias=True, norm="group", groups=GROUPS, name="layers")
+        layers = NormedMLP(self.widths, self.compute, use_bias=True, norm="group", groups=self.groups, name="layers")
         return maximum(layers(pair, train=False), 2, self.compute.kernels).astype(points.dtype)

@@ -72,7 +72,8 @@ def protocol(config: Config, pairs: int) -> str:
         return f"{data.source}, {pairs} recorded pairs turned by up to {data.max_angle_deg:g}°, {_points(data)} points per cloud{shown}"
     tested = f"{data.test_categories} categories" if data.tested == "test" else f"held out for validation, {data.categories} categories"
     categories = tested + (f" without {', '.join(data.exclude)}" if data.exclude else "")
-    crop = {"none": "no crop", "source": f"source cropped to {data.keep:.0%}"}.get(data.crop, f"{data.crop} crop to {data.keep:.0%}")
+    kept = f"{data.keep_least:.0%} to {data.keep:.0%}" if data.keep_least else f"{data.keep:.0%}"
+    crop = {"none": "no crop", "source": f"source cropped to {kept}"}.get(data.crop, f"{data.crop} crop to {kept}")
     level = f"up to {data.noise_std:g}" if data.noise == "uniform" else f"{data.noise_std:g}"
     noise = f"noise {level} clipped at {data.noise_clip:g}" if data.noise_std > 0 else "no noise"
     turn = " to either side" if data.turn == "either" else ""

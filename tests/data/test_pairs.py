@@ -57,6 +57,12 @@ def test_an_object_keeps_its_pose_or_has_one_for_each_pair(pose_of, poses):
     assert len({pair["source"].tobytes() for pair in drawn}) == 6
 
 
+def test_the_pose_of_an_object_is_not_drawn_by_the_numbers_that_draw_its_validation_pair():
+    each = [Pairs(Objects(), np.arange(12), replace(DATA, pose_of=of), None, DATA.test_seed) for of in ("each-object", "each-pair")]
+    kept, drawn = (np.array([pair["R"] for pair in pairs]) for pairs in each)
+    assert np.abs(kept - drawn).max(axis=(1, 2)).min() > 0.01
+
+
 @pytest.mark.parametrize("views", [None, VIEWS, BOTH, replace(BOTH, shown="shuffled")])
 def test_a_pair_is_a_function_of_seed_and_object_whichever_other_objects_there_are(views):
     objects = Objects()

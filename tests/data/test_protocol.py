@@ -235,7 +235,9 @@ def test_subsets_are_random_and_share_some_points():
 @pytest.mark.parametrize(("sampling", "count"), [("once", 301), ("twice", 151), ("subsets", 301)])
 def test_an_object_of_too_few_points_is_named(sampling, count):
     needed = 2 * count if sampling == "twice" else count
-    with pytest.raises(ValueError, match=f"thing has 300 points: expected at least {needed} for data.points={count}, sampling={sampling}"):
+    with pytest.raises(
+        ValueError, match=f"thing has 300 points: expected at least {needed} for {count} in a cloud and data.sampling={sampling}"
+    ):
         draw(replace(CLEAN, points=count, sampling=sampling))
 
 

@@ -28,6 +28,9 @@ def test_equals_normalising_the_padded_matrix_in_turn(rounds):
         padded[:, :-1] /= padded[:, :-1].sum(axis=2, keepdims=True)
         padded[:, :, :-1] /= padded[:, :, :-1].sum(axis=1, keepdims=True)
     np.testing.assert_allclose(np.exp(log_sinkhorn(logarithms, rounds)), padded[:, :-1, :-1], rtol=1e-12)
+    matching, slack = sinkhorn.log_sinkhorn_with_slack(logarithms, rounds)
+    np.testing.assert_allclose(np.exp(matching), padded[:, :-1, :-1], rtol=1e-12)
+    np.testing.assert_allclose(np.exp(slack), padded[:, :-1, -1], rtol=1e-12)
 
 
 def test_no_column_sums_to_more_than_1_and_in_the_end_no_row_does():

@@ -1,4 +1,4 @@
-"""Local features of point pairs: no motion of the cloud and no side of a normal changes them, and nothing but neighbours does."""
+"""Local features of point pairs: no motion of the cloud, order of its points or side of a normal changes them; lengths and angles do."""
 
 import jax
 import numpy as np

@@ -86,6 +86,8 @@ def test_twenty_large_pairs_stay_below_ten_megabytes(tmp_path, make_errors, make
         ({}, ["modelnet40-hdf5, all categories, 12 pairs; 1024 points sampled once", "shared crop to 75%", "noise 0.01 clipped at 0.05"]),
         ({"noise_std": 0.0, "crop": "none", "sampling": "twice"}, ["sampled twice, no crop, no noise"]),
         ({"exclude": ("cone", "vase"), "max_angle_deg": 60.0}, ["all categories without cone, vase", "up to 60° per axis,"]),
+        ({"keep_least": 0.4, "noise": "uniform"}, ["shared crop to 40% to 75%", "noise up to 0.01 clipped"]),
+        ({"tested": "validation"}, ["held out for validation, all categories, 12 pairs"]),
         ({"turn": "either"}, ["up to 45° per axis to either side,"]),
         ({"turn": "any"}, ["; any rotation, translations up to 0.5"]),
         ({"source": "stanford-scans"}, ["stanford-scans, 12 recorded pairs turned by up to 45°, 768 points per cloud"]),

@@ -8,6 +8,9 @@ from typing import Any, ClassVar, Literal
 
 from cmig_jax.config import ModelFlags, Needs, check
 
+LOCAL_GROUPS = 8
+"""Groups of the normalisation of local features."""
+
 
 @dataclass(frozen=True)
 class PointsFlags:
@@ -84,7 +87,8 @@ class MatchingFlags:
     """Correspondent of a source keypoint: the best target keypoint, the mean of all under the softmax of the matching, or under Sinkhorn's
     normalisation with slack, whose rows then weigh the correspondences too (not in the paper; RPM-Net's)."""
     features: Literal["once", "anew"] = "once"
-    """`anew`: each of the n iterations encodes the source as the ones before have moved it (not in the paper; PRNet's)."""
+    """`anew`: each of the n iterations encodes the source as the ones before have moved it, and further `repeats` keep the last features
+    (not in the paper; PRNet's). In training the running statistics see every encoding."""
     feature_widths: tuple[int, ...] = (256, 128, 64, 32, 32, 32)
     """Channels of the feature similarity network."""
     coordinate_widths: tuple[int, ...] = (32, 32, 32)
@@ -114,7 +118,8 @@ class LossFlags:
     overlap_threshold: float = 0.01
     """A point overlaps if the other cloud has a point closer than this under the true pose, object units."""
     match_threshold: float = 0.05
-    """Two keypoints correspond if they are closer than this under the true pose, object units."""
+    """Two keypoints correspond if they are closer than this under the true pose, object units; so do a point and its partner in
+    `keypoints.target=overlap`."""
     cross_modal: Literal["paper", "nt-xent", "off"] = "paper"
     """Cross-modal contrastive loss: Eq. 6 (no positive in the denominator), NT-Xent (with it), or none."""
     temperature: float = 0.1
@@ -122,7 +127,7 @@ class LossFlags:
     credibility_label: Literal["distance", "index"] = "distance"
     """Label of the matching score: correspondent closer than `match_threshold`, or with the same index."""
     match_mean: Literal["all", "positive"] = "all"
-    """Correspondence loss averaged over all K, or over those with a true correspondent."""
+    """Correspondence loss averaged over all K, or over those with a true correspondent; with Sinkhorn's matching, over all."""
 
 
 @dataclass(frozen=True)
@@ -164,8 +169,8 @@ class CMIGNetFlags(ModelFlags):
             (f"points.dim = {points.dim}", points.dim >= 4, "at least 4"),
             (
                 f"points.local_widths = {points.local_widths}",
-                _positive(points.local_widths) and not any(width % 8 for width in points.local_widths),
-                "one or more multiples of 8",
+                _positive(points.local_widths) and not any(width % LOCAL_GROUPS for width in points.local_widths),
+                f"one or more multiples of {LOCAL_GROUPS}",
             ),
             (
                 f"image.widths = {image.widths}",
@@ -188,10 +193,22 @@ class CMIGNetFlags(ModelFlags):
                 "model.fusion.points = transformer, whose weights it shares",
             ),
             (f"fusion.feed_forward = {fusion.feed_forward}", fusion.feed_forward >= 1, "at least 1"),
+            *(
+                (
+                    f"{flag} = {value} with model.keypoints.target = overlap",
+                    self.keypoints.target == "entropy" or value == expected,
+                    f"{expected}",
+                )
+                for flag, value, expected in (
+                    ("keypoints.select", self.keypoints.select, "predicted"),
+                    ("keypoints.activation", self.keypoints.activation, "linear"),
+                    ("keypoints.score_from", self.keypoints.score_from, "own"),
+                )
+            ),
             (
-                f"keypoints.target = overlap, select = {self.keypoints.select}, activation = {self.keypoints.activation}",
-                self.keypoints.target == "entropy" or (self.keypoints.select, self.keypoints.activation) == ("predicted", "linear"),
-                "model.keypoints.select = predicted and activation = linear with overlap",
+                f"matching.head = pcrnet with model.keypoints.target = {self.keypoints.target}, correspondence = {matching.correspondence}",
+                matching.head != "pcrnet" or (self.keypoints.target, matching.correspondence) in (("entropy", "hard"), ("entropy", "soft")),
+                "another head: this one matches no keypoints",
             ),
             (f"keypoints.count = {self.keypoints.count}", self.keypoints.count >= 2, "at least 2"),
             (

@@ -13,14 +13,13 @@ from cmig_jax.config import ComputeConfig
 from cmig_jax.geometry.distances import squared_distances
 from cmig_jax.models.cmignet.flags import CMIGNetFlags, LossFlags
 from cmig_jax.models.cmignet.prediction import CMIGNetPrediction, Iteration, MatchingPrediction
+from cmig_jax.models.overlap import overlapping
 from cmig_jax.ops.chunks import chunk_length, split
-from cmig_jax.ops.neighbours import nearest
 from cmig_jax.ops.pooling import maximum
 from cmig_jax.structs import Batch
 from cmig_jax.transform import RigidTransform
 
 T = TypeVar("T")
-SMALLEST_SLACK = 1e-6
 
 
 def losses(prediction: CMIGNetPrediction, batch: Batch, flags: CMIGNetFlags, compute: ComputeConfig) -> dict[str, Array]:
@@ -131,21 +130,15 @@ def partners(prediction: CMIGNetPrediction, batch: Batch, flags: LossFlags, rows
     return 0.5 * (entropies[0] + entropies[1])
 
 
-def overlapping(batch: Batch, threshold: float, rows: int = 0) -> tuple[Array, Array]:
-    """Return whether a point of the source, `[B, N]`, and of the target, `[B, M]`, has the other cloud closer under the true pose."""
-    moved = _present(batch.target_from_source).apply(batch.source)
-
-    def near(points: Array, others: Array) -> Array:
-        return jax.vmap(lambda x, y: nearest(x, y, rows)[1])(points, others) < threshold
-
-    return near(moved, batch.target), near(batch.target, moved)
-
-
 def matching(prediction: MatchingPrediction, iteration: Iteration, flags: LossFlags) -> Array:
-    """Return the negative log-likelihood of the true correspondents under the matching matrix (L_CS)."""
+    """Return the negative log-likelihood of the true correspondents under the matching matrix (L_CS).
+
+    With Sinkhorn's matching it is the mean over all keypoints, of those without a correspondent under the slack.
+    """
     index, label = _present(prediction.keypoints.match_index), _present(prediction.keypoints.match_label)
     if iteration.log_matching is not None:
-        return _sinkhorn_matching(iteration.log_matching, index, label)
+        chosen = jnp.take_along_axis(iteration.log_matching, index[..., None], axis=-1)[..., 0]
+        return -jnp.mean(jnp.where(label > 0, chosen, _present(iteration.log_slack)))
     log_p = jax.nn.log_softmax(_present(iteration.match), axis=-1)
     chosen = jnp.take_along_axis(log_p, index[..., None], axis=-1)[..., 0]
     count = jnp.maximum(jnp.sum(label), 1) if flags.match_mean == "positive" else label.size
@@ -175,13 +168,6 @@ def credibility(prediction: MatchingPrediction, iteration: Iteration, source: Ar
 def _present(value: T | None) -> T:
     assert value is not None, "this loss needs an output that a training pass with this head has"
     return value
-
-
-def _sinkhorn_matching(log_matching: Array, index: Array, label: Array) -> Array:
-    """Return the negative log-likelihood of the true correspondents, and of the slack for keypoints that have none."""
-    chosen = jnp.take_along_axis(log_matching, index[..., None], axis=-1)[..., 0]
-    slack = jnp.log(jnp.maximum(1 - jnp.sum(jnp.exp(log_matching), axis=-1), SMALLEST_SLACK))
-    return -jnp.mean(jnp.where(label > 0, chosen, slack))
 
 
 def _cross_modal(prediction: CMIGNetPrediction, flags: LossFlags, compute: ComputeConfig) -> Array:

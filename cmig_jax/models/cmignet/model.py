@@ -24,7 +24,7 @@ def stages(network: Any, variables: Any, batch: Batch, train: bool) -> dict[str,
         gather_keypoints(batch.target, fused[1], keypoints.target_index),
     )
     parts: dict[str, tuple[Callable[..., Any], tuple[Any, ...]]] = {
-        "point_encoder": (lambda m: m.encode(batch, train), ()),
+        "point_encoder": (lambda m: m.encode(batch.source, batch.target, train, m.local_features(batch)), ()),
         "fusion": (lambda m, *x: m.fuse(*x), (prediction.source_features, prediction.target_features, tokens)),
         "scores": (lambda m, *x: m.significance(*x), fused),
         "matching": (lambda m, *x: [y for i in m.iterate(*x, train)[0] for y in (i.match, i.logit)], sets),

@@ -13,8 +13,8 @@ import jax.numpy as jnp
 from jax import Array
 
 from cmig_jax.config import ComputeConfig
-from cmig_jax.geometry.sinkhorn import log_sinkhorn
-from cmig_jax.models.cmignet.flags import CMIGNetFlags
+from cmig_jax.geometry.sinkhorn import log_sinkhorn_with_slack
+from cmig_jax.models.cmignet.flags import LOCAL_GROUPS, CMIGNetFlags
 from cmig_jax.models.cmignet.heads import CMIGNetHead, IDAMHead, KeypointSet, Match, PCRNetHead
 from cmig_jax.models.cmignet.keypoints import (
     SignificanceScore,
@@ -36,7 +36,7 @@ from cmig_jax.structs import Batch, Correspondences
 from cmig_jax.transform import RigidTransform
 
 HIGHEST = jax.lax.Precision.HIGHEST
-SINKHORN_ROUNDS = 5
+SINKHORN_ROUNDS = 5  # RPM-Net's
 MATCH_LIMIT = 20.0  # |M| beyond which the reference clips, so that no softmax saturates
 
 
@@ -51,7 +51,7 @@ class CMIGNet(nn.Module):
         points, image, fusion = flags.points, flags.image, flags.fusion
         self.points = PointEncoder(points.k, points.widths, points.dim, compute)
         if points.local == "pairs":
-            self.local = LocalPairs(points.k, points.local_widths, compute)
+            self.local = LocalPairs(points.k, points.local_widths, LOCAL_GROUPS, compute)
         if flags.needs.views:
             self.views = ViewEncoder(image.widths, image.blocks, compute)
         if fusion.points == "transformer":
@@ -75,7 +75,8 @@ class CMIGNet(nn.Module):
             ValueError: too few points, unequal clouds where the flags need equal ones, or an input that is missing.
         """
         self._check(batch, train, key, source_index)
-        source, target = self.encode(batch, train)
+        local = self.local_features(batch)
+        source, target = self.encode(batch.source, batch.target, train, local)
         tokens = self.view_tokens(batch, train)
         fused_source, fused_target = self.fuse(source, target, tokens)
         source_scores, target_scores = self.significance(fused_source, fused_target)
@@ -85,17 +86,17 @@ class CMIGNet(nn.Module):
             else:
                 keypoints = self._keypoints(batch, source_scores, target_scores, key)
 
-        def sets(moved: Batch, features: tuple[Array, Array]) -> tuple[KeypointSet, KeypointSet]:
+        def sets(source: Array, features: tuple[Array, Array]) -> tuple[KeypointSet, KeypointSet]:
             return (
-                gather_keypoints(moved.source, features[0], keypoints.source_index, self._overlap(source_scores)),
-                gather_keypoints(moved.target, features[1], keypoints.target_index, self._overlap(target_scores)),
+                gather_keypoints(source, features[0], keypoints.source_index, self._overlap(source_scores)),
+                gather_keypoints(batch.target, features[1], keypoints.target_index, self._overlap(target_scores)),
             )
 
         def anew(pose: RigidTransform) -> tuple[KeypointSet, KeypointSet]:
-            moved = batch.moved(pose)
-            return sets(moved, self.fuse(*self.encode(moved, train), tokens))
+            moved = pose.apply(batch.source)
+            return sets(moved, self.fuse(*self.encode(moved, batch.target, train, local), tokens))
 
-        first = sets(batch, (fused_source, fused_target))
+        first = sets(batch.source, (fused_source, fused_target))
         iterations, pose = self.iterate(*first, train, anew if self.flags.matching.features == "anew" else None)
         return CMIGNetPrediction(
             target_from_source=pose,
@@ -113,14 +114,20 @@ class CMIGNet(nn.Module):
             iterations=iterations,
         )
 
-    def encode(self, batch: Batch, train: bool) -> tuple[Array, Array]:
+    def local_features(self, batch: Batch) -> tuple[Array, ...]:
+        """Return the local features of both clouds, `[B, N, F]` and `[B, M, F]`, which no motion changes; empty without any.
+
+        Raises:
+            ValueError: a cloud without normals.
+        """
+        if self.flags.points.local == "none":
+            return ()
+        if batch.source_normals is None or batch.target_normals is None:
+            raise ValueError("model.points.local = pairs reads unit normals: expected normals of both clouds, got None")
+        return self.local(batch.source, batch.source_normals), self.local(batch.target, batch.target_normals)
+
+    def encode(self, source: Array, target: Array, train: bool, local: tuple[Array, ...] = ()) -> tuple[Array, Array]:
         """Encode both clouds, as one batch if they have equal size: `[B, N, C]`, `[B, M, C]`."""
-        source, target = batch.source, batch.target
-        local = ()
-        if self.flags.points.local == "pairs":
-            if batch.source_normals is None or batch.target_normals is None:
-                raise ValueError("model.points.local = pairs reads unit normals: expected normals of both clouds, got None")
-            local = self.local(source, batch.source_normals), self.local(target, batch.target_normals)
         if source.shape[1] != target.shape[1]:
             source, target = self.points((source, target), train=train, local=local)
             return source, target
@@ -241,13 +248,14 @@ class CMIGNet(nn.Module):
         total = match.feature if match.coordinate is None else match.feature + match.coordinate
         total = jnp.clip(total, -MATCH_LIMIT, MATCH_LIMIT)
         correspondence = jnp.argmax(total, axis=-1)
-        score, log_matching = nn.sigmoid(match.logit), None
+        score, log_matching, log_slack = nn.sigmoid(match.logit), None, None
         if self.flags.matching.correspondence == "hard":
             corresponding = jnp.take_along_axis(target.points, correspondence[..., None], axis=1)
         elif self.flags.matching.correspondence == "soft":
             corresponding = jnp.matmul(nn.softmax(total, axis=-1), target.points, precision=HIGHEST)
         else:
-            log_matching = log_sinkhorn(total, SINKHORN_ROUNDS)
+            log_matching, log_slack = log_sinkhorn_with_slack(total, SINKHORN_ROUNDS)
+            correspondence = jnp.argmax(log_matching, axis=-1)
             corresponding = jnp.matmul(nn.softmax(log_matching, axis=-1), target.points, precision=HIGHEST)
             score *= jnp.sum(jnp.exp(log_matching), axis=-1)
         if source.overlap is not None:
@@ -263,6 +271,7 @@ class CMIGNet(nn.Module):
             coordinate_match=match.coordinate,
             match=total,
             log_matching=log_matching,
+            log_slack=log_slack,
             logit=match.logit,
             weight=weight,
             correspondence=correspondence,

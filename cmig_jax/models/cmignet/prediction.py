@@ -37,6 +37,7 @@ class Iteration:
         coordinate_match: `[B, K, K]` M_P (None for the idam and pcrnet heads).
         match: `[B, K, K]` matching matrix M before its softmax, clipped (None for pcrnet).
         log_matching: `[B, K, K]` logarithm of the matching by Sinkhorn's normalisation (None for others).
+        log_slack: `[B, K]` logarithm of its slack: how much of a source keypoint has no partner (None for others).
         logit: `[B, K]` matching score s before its sigmoid (None for pcrnet).
         weight: `[B, K]` w of Eq. 10, which sum to 1 (None for pcrnet).
         correspondence: `[B, K]` index of the target keypoint matched to each source keypoint (None for pcrnet).
@@ -49,6 +50,7 @@ class Iteration:
     coordinate_match: Array | None = None
     match: Array | None = None
     log_matching: Array | None = None
+    log_slack: Array | None = None
     logit: Array | None = None
     weight: Array | None = None
     correspondence: Array | None = None
@@ -73,7 +75,7 @@ class MatchingPrediction(Prediction):
 
 @struct.dataclass(kw_only=True)
 class CMIGNetPrediction(MatchingPrediction):
-    """What the network returns; the losses read this, never parameters.
+    """What the network returns; the losses read this, never parameters. It has overlaps with `keypoints.target=overlap` alone.
 
     Attributes:
         source_features, target_features: `[B, N, C]`, `[B, M, C]` of the point encoder, before fusion (F_X, F_Y).

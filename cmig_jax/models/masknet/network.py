@@ -17,6 +17,7 @@ from jax import Array
 from cmig_jax.config import ComputeConfig
 from cmig_jax.models.base import Model
 from cmig_jax.models.masknet.flags import MaskNetFlags
+from cmig_jax.models.overlap import overlapping
 from cmig_jax.nn.mlp import Dense, NormedMLP
 from cmig_jax.nn.pointnet import DenseBesidePooled, PointNet
 from cmig_jax.ops.neighbours import nearest, top_k
@@ -115,9 +116,7 @@ def masked(prediction: MaskNetPrediction, batch: Batch) -> Batch:
 
 def true_mask(batch: Batch, threshold: float) -> Array:
     """Return for each target point, `[B, M]`, 1 if a source point is closer than `threshold` under the true pose, else 0."""
-    assert batch.target_from_source is not None
-    _, distance = nearest(batch.target, batch.target_from_source.apply(batch.source))
-    return (distance < threshold).astype(batch.target.dtype)
+    return overlapping(batch, threshold)[1].astype(batch.target.dtype)
 
 
 def losses(prediction: MaskNetPrediction, batch: Batch, flags: MaskNetFlags, compute: ComputeConfig) -> dict[str, Array]:

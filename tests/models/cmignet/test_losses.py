@@ -8,6 +8,7 @@ from scipy.spatial.transform import Rotation
 from scipy.special import log_softmax
 
 from cmig_jax.config import ComputeConfig
+from cmig_jax.geometry.sinkhorn import log_sinkhorn_with_slack
 from cmig_jax.models.cmignet import losses as functions
 from cmig_jax.models.cmignet.flags import CMIGNetFlags, KeypointsFlags, LossFlags
 from cmig_jax.models.cmignet.losses import credibility, cross_modal, mask, matching, overlap
@@ -177,25 +178,25 @@ def test_matching_without_a_positive_label_is_zero_with_a_finite_gradient(mean):
     np.testing.assert_array_equal(gradient, 0)
 
 
-def test_a_normalised_matching_is_the_likelihood_of_partners_and_of_having_none():
+def test_sinkhorn_s_matching_is_the_likelihood_of_partners_and_of_having_none():
     prediction, _ = case()
-    rng, label = np.random.default_rng(4), prediction.keypoints.match_label
-    probabilities = rng.dirichlet(np.ones(K + 1), (B, K))  # the last one: no partner
-    iteration = prediction.iterations[0].replace(log_matching=np.log(probabilities[..., :-1]))
-    expected = -np.log(np.where(label > 0, np.diagonal(probabilities[..., :-1], axis1=1, axis2=2), probabilities[..., -1])).mean()
-    np.testing.assert_allclose(matching(prediction, iteration, LossFlags()), expected, rtol=1e-9)
+    label, log_matching = prediction.keypoints.match_label, np.random.default_rng(4).normal(size=(B, K, K + 1))
+    iteration = prediction.iterations[0].replace(log_matching=log_matching[..., :-1], log_slack=log_matching[..., -1])
+    expected = -np.where(label > 0, np.diagonal(log_matching[..., :-1], axis1=1, axis2=2), log_matching[..., -1]).mean()
+    np.testing.assert_allclose(matching(prediction, iteration, LossFlags(match_mean="positive")), expected, rtol=1e-9)
 
 
-def test_a_matching_without_slack_left_has_a_finite_loss_and_gradient():
+def test_a_sure_and_wrong_matching_of_a_keypoint_without_partner_is_corrected():
     prediction, _ = case(label=0.0)
-    sure = np.log(np.full((B, K, K), 1 / K))
+    sure = 15.0 * np.eye(K)[None].repeat(B, 0)
 
-    def loss(log_matching):
-        return matching(prediction, prediction.iterations[0].replace(log_matching=log_matching), LossFlags())
+    def loss(affinity):
+        log_matching, log_slack = log_sinkhorn_with_slack(affinity, 5)
+        return matching(prediction, prediction.iterations[0].replace(log_matching=log_matching, log_slack=log_slack), LossFlags())
 
     value, gradient = jax.value_and_grad(loss)(sure)
-    assert 10 < value < 20
-    assert np.isfinite(gradient).all()
+    assert value > 5
+    assert np.all(np.diagonal(gradient, axis1=1, axis2=2) > 0.01)
 
 
 def test_overlap_scores_learn_which_points_have_a_partner():

@@ -172,9 +172,10 @@ def test_features_anew_are_those_of_the_source_as_it_was_moved(local, tiny_flags
     found, once = evaluate(anew, variables, batch), evaluate(CMIGNet(flags), variables, batch)
     assert_same(found.iterations[0], once.iterations[0])
     first = found.iterations[0].step
+    turned = first.replace(t=np.zeros((2, 3)))
     # The second round alone: the network whose first round has the weights of the second, on the moved source.
     swapped = {kind: {**x, "heads_0": x["heads_1"]} if "heads_1" in x else x for kind, x in variables.items()}
-    second = evaluate(CMIGNet(flags), swapped, batch.moved(first))
+    second = evaluate(CMIGNet(flags), swapped, batch.replace(source=first.apply(batch.source), source_normals=turned.apply(unit[0])))
     assert_same(second.iterations[0].match, found.iterations[1].match)
     assert_same(second.iterations[0].step, found.iterations[1].step)
     assert np.abs(found.iterations[1].match - once.iterations[1].match).max() > 1e-3

@@ -19,6 +19,7 @@ from cmig_jax.models.networks import config_from_json
 
 ONLY_AT_TEST = ("data.test_categories", "data.tested")
 """Flags that a training does not depend on."""
+LONGEST_NAME = 200  # of what a training changes, in characters; file systems allow 255 for a folder
 
 
 @dataclass(frozen=True)
@@ -104,12 +105,15 @@ def _at_root(config: Config, roots: Mapping[str, str | None]) -> Config:
 
 
 def run_name(preset: str, flags: Flags, seed: int) -> str:
-    """Name a training by what it changes, so that rows with the same training share it."""
+    """Name a training by what it changes, or by a digest of that where it is too long, so that rows with the same training share it."""
 
     def text(value: Any) -> str:
         return ",".join(map(str, value)) if isinstance(value, tuple) else str(value)
 
-    return "+".join([preset, *(f"{flag}={text(value)}" for flag, value in sorted(flags.items())), f"seed={seed}"])
+    changed = "+".join(f"{flag}={text(value)}" for flag, value in sorted(flags.items()))
+    if len(changed) > LONGEST_NAME:
+        changed = hashlib.sha256(changed.encode()).hexdigest()[:16]
+    return "+".join(filter(None, [preset, changed, f"seed={seed}"]))
 
 
 def with_flags(config: Config, flags: Flags) -> Config:

@@ -41,6 +41,7 @@ def test_every_row_is_a_config_at_every_scale(name, scale):
         flags = dict(EXPERIMENTS[name].protocol) | dict(job.row.flags)
         kept = {flag: value for flag, value in flags.items() if not flag.startswith(SHRUNK[scale])}
         assert changes(with_flags(job.training, kept), job.training) == {}
+        assert len(job.run.name) <= 255
         assert changes(job.training, job.test).keys() <= set(job.row.test) | {"data.root"}
 
 

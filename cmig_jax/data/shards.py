@@ -148,7 +148,8 @@ def check_settings(folder: Path, data: DataConfig, views: ViewsConfig) -> None:
     made, wanted = manifest["settings"], settings_of(data, views)
     per_object = data.most_points * (2 if data.sampling == "twice" else 1)
     if manifest["distinct"] < per_object:
-        detail = f"{_points(data)} with data.sampling = {data.sampling}"
+        detail = f"data.points = {data.points} with data.sampling = {data.sampling}"
+        detail += f" and data.keep_least = {data.keep_least}" if data.keep_least else ""
         raise ValueError(f"{detail} needs {per_object} points of every object, but {folder} has objects of {manifest['distinct']}")
     names = ["data.source", *(f"data.{flag}" for flag in source_of(data).flags)]
     if views.of == "object":
@@ -159,11 +160,6 @@ def check_settings(folder: Path, data: DataConfig, views: ViewsConfig) -> None:
                 f"{name} = {wanted.get(name)}, but {folder} was prepared with {name} = {made.get(name)}: "
                 "name another folder (data.prepared), or change the flag"
             )
-
-
-def _points(data: DataConfig) -> str:
-    drawn = f" and data.keep_least = {data.keep_least}, so up to {data.most_points} points," if data.keep_least else ""
-    return f"data.points = {data.points}{drawn}"
 
 
 def repair_command(settings: Mapping[str, Any], folder: Path) -> str:

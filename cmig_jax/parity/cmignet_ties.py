@@ -9,7 +9,7 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from cmig_jax.models.cmignet.network import MATCH_LIMIT
+from cmig_jax.models.cmignet.solve import MATCH_LIMIT
 from cmig_jax.parity.cases import Arrays, Case, State
 from cmig_jax.parity.rows import Dtype
 

@@ -180,6 +180,8 @@ def test_other_settings_are_refused_by_name(data, prepared_meshes, tmp_path):
         prepare(data, larger, prepared_meshes, workers=1, progress=False)
     with pytest.raises(ValueError, match=r"data\.points = 1500 .* needs 3000 points of every object, but .* 2048"):
         check_settings(prepared_meshes, twice, VIEWS)
+    with pytest.raises(ValueError, match=r"data\.points = 1024 .* data\.keep_least = 0\.3 needs 2560 points of every object, but .* 2048"):
+        check_settings(prepared_meshes, replace(data, points=1024, keep=0.75, crop="shared", sampling="once", keep_least=0.3), VIEWS)
     with pytest.raises(ValueError, match=r"data\.source = stanford, but .* data\.source = meshes"):
         check_settings(prepared_meshes, replace(data, source="stanford"), VIEWS)
     for same, views in ((replace(data, points=1500), VIEWS), (replace(data, root="moved"), VIEWS), (data, replace(VIEWS, of="both"))):

@@ -13,7 +13,6 @@ import jax.numpy as jnp
 from jax import Array
 
 from cmig_jax.config import ComputeConfig
-from cmig_jax.geometry.sinkhorn import log_sinkhorn_with_slack
 from cmig_jax.models.cmignet.flags import LOCAL_GROUPS, CMIGNetFlags
 from cmig_jax.models.cmignet.heads import CMIGNetHead, IDAMHead, KeypointSet, Match, PCRNetHead
 from cmig_jax.models.cmignet.keypoints import (
@@ -24,6 +23,7 @@ from cmig_jax.models.cmignet.keypoints import (
     true_correspondents,
 )
 from cmig_jax.models.cmignet.prediction import CMIGNetPrediction, Iteration, Keypoints
+from cmig_jax.models.cmignet.solve import final_correspondences, solve
 from cmig_jax.nn.attention import CrossAttention, PairTransformer
 from cmig_jax.nn.edgeconv import PointEncoder
 from cmig_jax.nn.local_pairs import LocalPairs
@@ -31,13 +31,8 @@ from cmig_jax.nn.recompute import call
 from cmig_jax.nn.resnet import ViewEncoder
 from cmig_jax.ops.neighbours import top_k
 from cmig_jax.ops.pooling import maximum
-from cmig_jax.ops.procrustes import weighted_procrustes
-from cmig_jax.structs import Batch, Correspondences
+from cmig_jax.structs import Batch
 from cmig_jax.transform import RigidTransform
-
-HIGHEST = jax.lax.Precision.HIGHEST
-SINKHORN_ROUNDS = 5  # RPM-Net's
-MATCH_LIMIT = 20.0  # |M| beyond which the reference clips, so that no softmax saturates
 
 
 class CMIGNet(nn.Module):
@@ -102,7 +97,7 @@ class CMIGNet(nn.Module):
             target_from_source=pose,
             source_overlap=self._overlap(source_scores),
             target_overlap=self._overlap(target_scores),
-            correspondences=_correspondences(keypoints, iterations[-1]),
+            correspondences=final_correspondences(keypoints, iterations[-1]),
             source_features=source,
             target_features=target,
             image_features=None if tokens is None else maximum(tokens, 2, self.compute.kernels),
@@ -244,56 +239,10 @@ class CMIGNet(nn.Module):
         return pair_in_order(source_index, correspondent, label)
 
     def _solve(self, match: Match, source: KeypointSet, target: KeypointSet) -> Iteration:
-        """Turn a matching into correspondences, weights (Eq. 10) and a pose (Eq. 11)."""
-        total = match.feature if match.coordinate is None else match.feature + match.coordinate
-        total = jnp.clip(total, -MATCH_LIMIT, MATCH_LIMIT)
-        correspondence = jnp.argmax(total, axis=-1)
-        score, log_matching, log_slack = nn.sigmoid(match.logit), None, None
-        if self.flags.matching.correspondence == "hard":
-            corresponding = jnp.take_along_axis(target.points, correspondence[..., None], axis=1)
-        elif self.flags.matching.correspondence == "soft":
-            corresponding = jnp.matmul(nn.softmax(total, axis=-1), target.points, precision=HIGHEST)
-        else:
-            log_matching, log_slack = log_sinkhorn_with_slack(total, SINKHORN_ROUNDS)
-            correspondence = jnp.argmax(log_matching, axis=-1)
-            corresponding = jnp.matmul(nn.softmax(log_matching, axis=-1), target.points, precision=HIGHEST)
-            score *= jnp.sum(jnp.exp(log_matching), axis=-1)
-        if source.overlap is not None:
-            score *= source.overlap
-        weight = credible_half(score)
-        step = weighted_procrustes(source.points, corresponding, weight, self.flags.pose.centroid, self.compute.kernels)
-        if self.flags.pose.gradient == "stopped":
-            step = jax.lax.stop_gradient(step)
-        return Iteration(
-            source=source.points,
-            step=step,
-            feature_match=match.feature,
-            coordinate_match=match.coordinate,
-            match=total,
-            log_matching=log_matching,
-            log_slack=log_slack,
-            logit=match.logit,
-            weight=weight,
-            correspondence=correspondence,
-            corresponding=corresponding,
-        )
-
-
-def credible_half(score: Array) -> Array:
-    """Turn scores `[B, K]` into weights that sum to 1, 0 below the lower of the medians (Eq. 10)."""
-    K = score.shape[-1]
-    median = jnp.sort(jax.lax.stop_gradient(score), axis=-1)[..., (K - 1) // 2, None]
-    weight = jnp.where(score >= median, score, 0)
-    return weight / (jnp.sum(weight, axis=-1, keepdims=True) + 1e-8)
+        return solve(match, source, target, self.flags, self.compute.kernels)
 
 
 def gather_keypoints(points: Array, features: Array, index: Array, overlap: Array | None = None) -> KeypointSet:
     """Select keypoints `[B, K]` of points `[B, N, 3]`, features `[B, N, C]` and overlap scores `[B, N]`."""
     take = jax.vmap(lambda x, i: x[i])
     return KeypointSet(take(points, index), take(features, index), None if overlap is None else take(overlap, index))
-
-
-def _correspondences(keypoints: Keypoints, last: Iteration) -> Correspondences | None:
-    if last.correspondence is None or last.weight is None:
-        return None
-    return Correspondences(keypoints.source_index, keypoints.target_index, last.correspondence, last.weight)

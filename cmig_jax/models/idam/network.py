@@ -21,8 +21,9 @@ from cmig_jax.models.cmignet import losses as shared
 from cmig_jax.models.cmignet.flags import LossFlags
 from cmig_jax.models.cmignet.heads import KeypointSet
 from cmig_jax.models.cmignet.keypoints import draw_for_training, pair_in_order, true_correspondents
-from cmig_jax.models.cmignet.network import credible_half, gather_keypoints
+from cmig_jax.models.cmignet.network import gather_keypoints
 from cmig_jax.models.cmignet.prediction import Iteration, Keypoints, MatchingPrediction
+from cmig_jax.models.cmignet.solve import credible_half
 from cmig_jax.models.idam.flags import IDAMFlags
 from cmig_jax.nn.mlp import Dense, NormedMLP, Weights
 from cmig_jax.nn.norm import BatchNorm

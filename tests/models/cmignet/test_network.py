@@ -10,7 +10,8 @@ import pytest
 from cmig_jax.config import ComputeConfig
 from cmig_jax.models.base import predict
 from cmig_jax.models.cmignet.heads import KeypointSet, Match
-from cmig_jax.models.cmignet.network import CMIGNet, credible_half
+from cmig_jax.models.cmignet.network import CMIGNet
+from cmig_jax.models.cmignet.solve import credible_half
 from cmig_jax.ops.procrustes import weighted_procrustes
 
 evaluate = jax.jit(predict, static_argnums=0)

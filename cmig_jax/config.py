@@ -99,9 +99,6 @@ class DataConfig:
     pose: Poses = "euler"
     """`euler`: rotation and translation as the next three flags say; `twist`: the exponential of a twist (w, v) of uniform direction in six
     dimensions and of uniform length in [0, max_twist], whatever those say (PointNetLK, MaskNet)."""
-    pose_of: Drawn = "each-pair"
-    """Whose pose is drawn: that of each pair, or one pose for each object, which it keeps throughout the training (PCRNet's released
-    code)."""
     max_angle_deg: float = 45.0
     """Each of the three Euler angles is uniform in [0, this], degrees (Sec. IV-B)."""
     turn: Turn = "positive"
@@ -111,6 +108,9 @@ class DataConfig:
     """Each translation component is uniform in [-this, this], object units (Sec. IV-B)."""
     max_twist: float = 0.8
     """Largest length of a twist with `pose=twist`: w in radians, v in object units. It is also the largest angle of rotation."""
+    pose_of: Drawn = "each-pair"
+    """Whose pose is drawn: that of each pair, or one pose for each object, which it keeps throughout the training (PCRNet's released
+    code)."""
     normals: Normals = "object"
     """Normals of a network that reads them. `object`: of the complete object's surface, turned with it (RPM-Net): those of the faces of a
     mesh, or of the file, else estimated from the cloud. `observed`: estimated from each cropped, noisy cloud. Recorded pairs and `register`

@@ -148,10 +148,8 @@ def listing(catalogue: Catalogue) -> list[str]:
 
 
 def _flags(flags: Flags) -> str:
-    return (
-        " ".join(f"{flag}={' '.join(map(str, value)) if isinstance(value, tuple) else value}" for flag, value in flags.items())
-        or "as it is"
-    )
+    texts = {flag: " ".join(map(str, value)) if isinstance(value, tuple) else value for flag, value in flags.items()}
+    return " ".join(f"{flag}={text}" for flag, text in texts.items()) or "as it is"
 
 
 def write(folder: Path, name: str, experiment: Experiment, results: Results) -> None:

@@ -75,6 +75,7 @@ class CMIGNet(nn.Module):
         tokens = self.view_tokens(batch, train)
         fused_source, fused_target = self.fuse(source, target, tokens)
         source_scores, target_scores = self.significance(fused_source, fused_target)
+        source_overlap, target_overlap = self._overlap(source_scores), self._overlap(target_scores)
         with jax.named_scope("keypoints"):
             if train:
                 keypoints = self._training_keypoints(batch, key, source_index)
@@ -83,8 +84,8 @@ class CMIGNet(nn.Module):
 
         def sets(source: Array, features: tuple[Array, Array]) -> tuple[KeypointSet, KeypointSet]:
             return (
-                gather_keypoints(source, features[0], keypoints.source_index, self._overlap(source_scores)),
-                gather_keypoints(batch.target, features[1], keypoints.target_index, self._overlap(target_scores)),
+                gather_keypoints(source, features[0], keypoints.source_index, source_overlap),
+                gather_keypoints(batch.target, features[1], keypoints.target_index, target_overlap),
             )
 
         def anew(pose: RigidTransform) -> tuple[KeypointSet, KeypointSet]:
@@ -95,8 +96,8 @@ class CMIGNet(nn.Module):
         iterations, pose = self.iterate(*first, train, anew if self.flags.matching.features == "anew" else None)
         return CMIGNetPrediction(
             target_from_source=pose,
-            source_overlap=self._overlap(source_scores),
-            target_overlap=self._overlap(target_scores),
+            source_overlap=source_overlap,
+            target_overlap=target_overlap,
             correspondences=final_correspondences(keypoints, iterations[-1]),
             source_features=source,
             target_features=target,

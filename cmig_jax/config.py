@@ -25,6 +25,7 @@ Poses = Literal["euler", "twist"]
 Drawn = Literal["each-pair", "each-object"]
 Noise = Literal["fixed", "uniform"]
 Tested = Literal["test", "validation"]
+Frame = Literal["object", "any", "half"]
 Normals = Literal["object", "observed"]
 Layout = Literal["dodecahedron", "ring", "axes"]
 Rule = tuple[str, bool, str]
@@ -111,6 +112,9 @@ class DataConfig:
     pose_of: Drawn = "each-pair"
     """Whose pose is drawn: that of each pair, or one pose for each object, which it keeps throughout the training (PCRNet's released
     code)."""
+    frame: Frame = "object"
+    """`any`: each pair is turned at random as a whole, so that objects, crops and motions have no preferred direction; `half`: half of the
+    training pairs are, those of validation and test are not. In the frame of its object, which stands upright, a pair is easier."""
     normals: Normals = "object"
     """Normals of a network that reads them. `object`: of the complete object's surface, turned with it (RPM-Net): those of the faces of a
     mesh, or of the file, else estimated from the cloud. `observed`: estimated from each cropped, noisy cloud. Recorded pairs and `register`
@@ -163,6 +167,11 @@ class DataConfig:
     def most_points(self) -> int:
         """Points per cloud before the crop, at most."""
         return math.ceil(self.cropped_points / self.keep_least) if self.keep_least else self.points
+
+    @property
+    def as_tested(self) -> DataConfig:
+        """The protocol of validation and test pairs."""
+        return replace(self, frame="object") if self.frame == "half" else self
 
     @property
     def target_points(self) -> int:
@@ -329,6 +338,11 @@ class Config:
                     f"data.crop = {self.data.crop}",
                     not (equal and self.data.crop == "source"),
                     "another crop, since the network needs equal sizes",
+                ),
+                (
+                    f"data.frame = {self.data.frame} with views.of = {self.views.of}",
+                    self.data.frame == "object" or self.views.of != "object" or not self.model.needs.views,
+                    "views of the observed clouds: those of an object are rendered in its own frame",
                 ),
             ]
         )

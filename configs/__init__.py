@@ -11,11 +11,12 @@ from cmig_jax.config import Config
 
 from .methods import METHODS
 from .modelnet40 import corrected, corrected_cpu, modelnet40_cpu, paper, paper_cpu, released, released_cpu
-from .quickstart import own_clouds, quickstart
+from .quickstart import own_clouds, own_clouds_cmignet, quickstart
 
 PRESETS: dict[str, Callable[[], Config]] = {
     "quickstart": quickstart,
     "own-clouds": own_clouds,
+    "own-clouds-cmignet": own_clouds_cmignet,
     "paper": paper,
     "released": released,
     "corrected": corrected,

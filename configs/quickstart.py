@@ -14,6 +14,7 @@ from cmig_jax.models.cmignet.flags import (
     MatchingFlags,
     PointsFlags,
 )
+from cmig_jax.models.patches.flags import PatchFlags
 
 
 def quickstart() -> Config:
@@ -27,13 +28,26 @@ def quickstart() -> Config:
     )
 
 
+OWN_CLOUDS = DataConfig(source="shapes", shapes=80, points=512, sampling="twice", crop="independent", turn="either")
+
+
 def own_clouds() -> Config:
     """The network that comes with the package: generated objects, each cloud sampled and cropped on its own, turned to either side."""
+    return Config(
+        name="own-clouds",
+        data=replace(OWN_CLOUDS, shapes=160, frame="half", noise="uniform", noise_std=0.02, keep_least=0.6),
+        model=PatchFlags(),
+        optim=OptimConfig(learning_rate=2e-3, weight_decay=0.0, schedule="cosine", epochs=90, batch=16, clip_norm=1.0, validate_every=15),
+    )
+
+
+def own_clouds_cmignet() -> Config:
+    """The same data for CMIGNet at a small size, which came with version 0.2."""
     model = small_network()
     return replace(
         quickstart(),
-        name="own-clouds",
-        data=DataConfig(source="shapes", shapes=80, points=512, sampling="twice", crop="independent", turn="either"),
+        name="own-clouds-cmignet",
+        data=OWN_CLOUDS,
         model=replace(
             model,
             keypoints=replace(model.keypoints, test_count=384),

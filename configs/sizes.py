@@ -13,6 +13,7 @@ from cmig_jax.models.finet.flags import FINetFlags
 from cmig_jax.models.idam.flags import IDAMFlags
 from cmig_jax.models.masknet.flags import MaskNetFlags
 from cmig_jax.models.omnet.flags import OMNetFlags
+from cmig_jax.models.patches.flags import PatchFlags
 from cmig_jax.models.pcrnet.flags import PCRNetFlags
 from cmig_jax.models.pointnetlk.flags import PointNetLKFlags
 from cmig_jax.models.prnet.flags import PRNetFlags
@@ -73,6 +74,7 @@ CPU: dict[type[ModelFlags], Resize] = {
         decoder_widths=(128, 64, 64),
         regression_widths=(256, 128, 64),
     ),
+    PatchFlags: lambda flags: replace(flags, test_patches=144),
     PCRNetFlags: lambda flags: replace(flags, widths=(32, 32, 32, 64, 256), head_widths=(256, 256, 128, 128, 64)),
     PointNetLKFlags: lambda flags: replace(
         flags, widths=(*(w // 2 for w in (64, 64, 64, 128)[-len(flags.widths) + 1 :]), 256), training_points=min(flags.training_points, 72)
@@ -91,6 +93,9 @@ TOY: dict[type[ModelFlags], Resize] = {
     MaskNetFlags: lambda flags: replace(flags, widths=(4, 8), mask_widths=(8, 4), icp_iterations=2),
     OMNetFlags: lambda flags: replace(
         flags, local_widths=(4,), global_widths=(4, 8), fusion_widths=(8,), decoder_widths=(4, 4, 4), regression_widths=(8,)
+    ),
+    PatchFlags: lambda flags: replace(
+        flags, k=4, patch_widths=(4, 4), dim=8, layers=1, heads=2, feed_forward=8, patches=12, test_patches=24, passes=2
     ),
     PCRNetFlags: lambda flags: replace(flags, widths=(4, 8), head_widths=(8, 4), iterations=2),
     PointNetLKFlags: lambda flags: replace(

@@ -99,6 +99,7 @@ def test_every_rule_is_tested_above(monkeypatch):
     apart = {
         "model.fusion.image",
         "data.crop",
+        "data.frame",
         "model.matching.head",
         *(f"model.keypoints.{x}" for x in ("select", "activation", "score_from")),
     }
@@ -121,6 +122,14 @@ def test_a_regressed_pose_has_no_matching_to_change(group, flag, value):
     regressed = dataclasses.replace(PAPER.model, matching=cmignet.MatchingFlags(head="pcrnet"))
     with pytest.raises(ValueError, match=rf"model\.matching\.head = pcrnet with .*{flag} = {value}.*: expected another head"):
         dataclasses.replace(regressed, **{group: dataclasses.replace(getattr(regressed, group), **{flag: value})})
+
+
+@pytest.mark.parametrize("frame", ["any", "half"])
+def test_views_of_objects_are_in_the_objects_frames(frame):
+    with pytest.raises(ValueError, match=rf"data\.frame = {frame} with views\.of = object: expected views of the observed clouds"):
+        changed(PAPER, "data.frame", frame)
+    observed = changed(changed(PAPER, "views.of", "both"), "data.frame", frame)
+    assert observed.data.as_tested.frame == {"any": "any", "half": "object"}[frame]
 
 
 def test_a_share_is_drawn_for_crops_of_both_clouds():

@@ -18,7 +18,7 @@ from configs import PRESETS
 from configs.methods import METHODS
 from configs.scale import SCALES
 
-CORRECTED = ("corrected", "corrected-cpu", "quickstart", "own-clouds", "modelnet40-cpu")
+CORRECTED = ("corrected", "corrected-cpu", "quickstart", "own-clouds-cmignet", "modelnet40-cpu")
 
 
 SMALL_METHODS = {name for name in METHODS if name.endswith("-cpu")}  # `tests/experiments/test_rows.py` traces such networks too

@@ -15,7 +15,7 @@ import numpy as np
 
 from cmig_jax.config import Categories, DataConfig, ViewsConfig
 from cmig_jax.data.normals import observed_normals
-from cmig_jax.data.protocol import make_clouds
+from cmig_jax.data.protocol import make_clouds, random_rotation
 from cmig_jax.data.render import render_views
 from cmig_jax.data.shards import Shards
 
@@ -100,12 +100,16 @@ def make_pair(objects: Shards, index: int, data: DataConfig, rng: np.random.Gene
     clouds = make_clouds(rows, data, f"object {objects.names[index]}", rng, poses)
     if normals and data.normals == "observed":
         clouds |= {f"{cloud}_normals": observed_normals(clouds[cloud]) for cloud in ("source", "target")}
-    return {
-        **clouds,
-        "object": np.asarray(points, np.float32),
-        "label": np.int32(objects.labels[index]),
-        "index": np.int32(index),
-    }
+    pair = {**clouds, "object": np.asarray(points, np.float32), "label": np.int32(objects.labels[index]), "index": np.int32(index)}
+    return turned(pair, random_rotation(rng)) if data.frame == "any" or (data.frame == "half" and rng.random() < 0.5) else pair
+
+
+def turned(pair: Pair, rotation: np.ndarray) -> Pair:
+    """Turn a pair without views as a whole, by `[3, 3]`: another frame for the same clouds."""
+    parts = ("source", "target", "object", "source_normals", "target_normals")
+    moved = {key: pair[key] @ rotation.T for key in parts if key in pair}
+    moved |= {"R": rotation @ pair["R"] @ rotation.T, "t": rotation @ pair["t"]}
+    return pair | {key: np.ascontiguousarray(value, np.float32) for key, value in moved.items()}
 
 
 def observe(objects: Shards, pair: Pair, views: ViewsConfig) -> np.ndarray:

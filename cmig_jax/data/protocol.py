@@ -117,15 +117,20 @@ def random_pose(
     With turn = any, R is uniform over all rotations.
     """
     if turn == "any":
-        return Rotation.from_quat(rng.normal(size=4)).as_matrix(), rng.uniform(-max_translation, max_translation, 3)
+        return random_rotation(rng), rng.uniform(-max_translation, max_translation, 3)
     x, y, z = rng.uniform(-max_angle_deg if turn == "either" else 0, max_angle_deg, 3)
     R = Rotation.from_euler("zyx", [z, y, x], degrees=True).as_matrix()
     return R, rng.uniform(-max_translation, max_translation, 3)
 
 
+def random_rotation(rng: np.random.Generator) -> np.ndarray:
+    """Draw R `[3, 3]`, uniform over all rotations."""
+    return Rotation.from_quat(rng.normal(size=4)).as_matrix()
+
+
 def mean_angle_deg(data: DataConfig) -> float:
-    """Return the mean of each of the three angles that `draw_pose` draws; 0 for recorded pairs, whose angles have either sign."""
-    one_sided = data.pose == "euler" and data.turn == "positive" and not source_of(data).records
+    """Return the mean of each of the three angles of a pair; 0 in any frame, and for recorded pairs, whose angles have either sign."""
+    one_sided = data.pose == "euler" and data.turn == "positive" and data.frame != "any" and not source_of(data).records
     return data.max_angle_deg / 2 if one_sided else 0.0
 
 

@@ -22,7 +22,7 @@ def pairs_to_test(config: Config, limit: int | None = None) -> Pairs | RecordedP
         ValueError: there is no test object, fewer than two training objects to hold some out, recorded pairs with `data.tested =
             validation`, or fewer points per cloud than the network needs.
     """
-    data, needs = config.data, config.model.needs
+    data, needs = config.data.as_tested, config.model.needs
     if data.cropped_points < needs.points:
         left = f"data.points = {data.points} leaves {data.cropped_points} points after the crop"
         raise ValueError(f"{left}: expected at least {needs.points}, which the network needs")

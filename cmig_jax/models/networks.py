@@ -12,12 +12,15 @@ from cmig_jax.models.finet.network import FINET
 from cmig_jax.models.idam.network import IDAM
 from cmig_jax.models.masknet.network import MASKNET
 from cmig_jax.models.omnet.network import OMNET
+from cmig_jax.models.patches.network import PATCHES
 from cmig_jax.models.pcrnet.network import PCRNET
 from cmig_jax.models.pointnetlk.network import POINTNETLK
 from cmig_jax.models.prnet.network import PRNET
 from cmig_jax.models.rpmnet.network import RPMNET
 
-NETWORKS: dict[str, Model] = {model.name: model for model in (CMIGNET, POINTNETLK, DCP, PRNET, IDAM, RPMNET, PCRNET, MASKNET, OMNET, FINET)}
+NETWORKS: dict[str, Model] = {
+    model.name: model for model in (CMIGNET, PATCHES, POINTNETLK, DCP, PRNET, IDAM, RPMNET, PCRNET, MASKNET, OMNET, FINET)
+}
 
 
 def model_of(flags: ModelFlags) -> Model:

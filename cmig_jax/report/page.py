@@ -80,6 +80,7 @@ def protocol(config: Config, pairs: int) -> str:
     rotations = "any rotation" if data.turn == "any" else f"rotations up to {data.max_angle_deg:g}° per axis{turn}"
     pose = f"{rotations}, translations up to {data.max_translation:g}"
     pose = f"twists up to {data.max_twist:g}" if data.pose == "twist" else pose
+    pose += ", in any frame" if data.frame == "any" else ""
     normals = f", normals: {data.normals}" if config.model.needs.normals else ""
     made = f"{data.points} points sampled {data.sampling}, {crop}, {noise}{normals}"
     return f"{data.source}, {categories}, {pairs} pairs; {made}; {pose}{shown}"

@@ -96,7 +96,7 @@ def training_data(config: Config) -> TrainingData:
     views, normals = config.views if needs.views else None, needs.normals
     return TrainingData(
         train=Pairs(objects, train, data, views, config.seed, normals=normals),
-        validation=Pairs(objects, held, data, views, data.test_seed, normals=normals),
+        validation=Pairs(objects, held, data.as_tested, views, data.test_seed, normals=normals),
     )
 
 

@@ -5,9 +5,11 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from scipy.spatial.transform import Rotation
 
 from cmig_jax.config import DataConfig, ViewsConfig
 from cmig_jax.data.loader import stack
+from cmig_jax.data.normals import observed_normals
 from cmig_jax.data.pairs import Pairs, evenly_spaced, in_categories, make_pair, observe, render_clouds
 
 DATA = DataConfig(points=100)
@@ -112,6 +114,26 @@ def test_the_numbers_of_a_pair_stay_those_of_earlier_versions(protocol):
     np.testing.assert_allclose(pair["t"], [0.39281, 0.21245, 0.31663], atol=2e-5)
     np.testing.assert_allclose(pair["views"].mean(axis=(1, 2, 3)), greys, atol=0.5)
     np.testing.assert_allclose(pairs[1]["t"], [0.24388, 0.33287, 0.20134], atol=2e-5)  # seeded by the object's name
+
+
+def test_a_frame_turns_a_pair_as_a_whole():
+    plain, turned = (make_pair(Objects(), 3, replace(DATA, frame=frame), np.random.default_rng(0)) for frame in ("object", "any"))
+    Q, _ = Rotation.align_vectors(turned["object"], plain["object"])
+    assert Q.magnitude() > 0.1
+    for part in ("source", "target", "object", "t"):
+        np.testing.assert_allclose(turned[part], Q.apply(plain[part]), atol=1e-6)
+    np.testing.assert_allclose(turned["R"], Q.as_matrix() @ plain["R"] @ Q.as_matrix().T, atol=1e-6)
+    assert {part: value.dtype for part, value in turned.items()} == {part: value.dtype for part, value in plain.items()}
+    normals = make_pair(Objects(), 3, replace(DATA, frame="any", normals="observed"), np.random.default_rng(0), normals=True)
+    near = observed_normals(turned["source"])
+    np.testing.assert_allclose(np.abs(np.sum(normals["source_normals"] * near, axis=1)), 1, atol=1e-4)
+
+
+def test_half_of_the_training_pairs_are_turned():
+    pairs = [Pairs(Objects(), np.array([3]), replace(DATA, frame=frame), None, 0) for frame in ("object", "half", "any")]
+    of = [[pair.draw(0, np.random.default_rng(i))["R"] for i in range(200)] for pair in pairs]
+    assert 70 < sum(np.array_equal(R, plain) for R, plain in zip(of[1], of[0], strict=True)) < 130
+    assert not any(np.array_equal(R, plain) for R, plain in zip(of[2], of[0], strict=True))
 
 
 def test_an_object_of_too_few_points_is_named():

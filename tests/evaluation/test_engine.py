@@ -170,6 +170,14 @@ def test_validation_pairs_are_those_that_the_training_holds_out(tiny):
     np.testing.assert_array_equal(held[0]["target"], trained.validation[0]["target"])
 
 
+def test_half_of_the_frames_are_turned_in_training_alone(tiny):
+    half, plain = (replace(tiny, data=replace(tiny.data, frame=frame)) for frame in ("half", "object"))
+    for pairs in (pairs_to_test, lambda config: training_data(config).validation):
+        assert all(np.array_equal(one["R"], other["R"]) for one, other in zip(pairs(half), pairs(plain), strict=True))
+    any_frame = pairs_to_test(replace(tiny, data=replace(tiny.data, frame="any")))
+    assert not any(np.array_equal(one["R"], other["R"]) for one, other in zip(any_frame, pairs_to_test(plain), strict=True))
+
+
 def test_rpmnet_s_protocol_keeps_70_percent_of_independent_samplings(tiny, tmp_path):
     data = replace(tiny.data, points=30, sampling="twice", crop="half-space", keep=0.7, prepared=str(tmp_path))
     config = replace(tiny, data=data)

@@ -28,7 +28,7 @@ def test_every_table_and_figure_of_the_paper_is_there():
 
 SHRUNK = {"full": (), "short": ("optim.epochs",), "cpu": ("data.points", "optim.", "model.keypoints.count")}
 """Flags of rows that a scale sets for all."""
-SHRUNK["toy"] = (*SHRUNK["cpu"], "data.shapes")
+SHRUNK["toy"] = (*SHRUNK["cpu"], "data.shapes", "views.size", "model.patches", "model.layers", "model.dim")
 
 
 @pytest.mark.parametrize("scale", SHRUNK)

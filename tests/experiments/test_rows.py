@@ -48,7 +48,14 @@ def described(config):
 
 
 def test_all_presets_and_heads_are_among_them():
-    assert {name.split("+")[0] for name in TRAININGS} == {"paper", "released", "corrected", "own-clouds", *METHODS.values()}
+    assert {name.split("+")[0] for name in TRAININGS} == {
+        "paper",
+        "released",
+        "corrected",
+        "own-clouds",
+        "own-clouds-cmignet",
+        *METHODS.values(),
+    }
     assert any("pcrnet" in name for name in TRAININGS)
     assert len(TESTS) > len(TRAININGS) > 20
 

@@ -89,12 +89,13 @@ def test_twenty_large_pairs_stay_below_ten_megabytes(tmp_path, make_errors, make
         ({"keep_least": 0.4, "noise": "uniform"}, ["shared crop to 40% to 75%", "noise up to 0.01 clipped"]),
         ({"tested": "validation"}, ["held out for validation, all categories, 12 pairs"]),
         ({"turn": "either"}, ["up to 45° per axis to either side,"]),
+        ({"frame": "any"}, ["translations up to 0.5, in any frame"]),
         ({"turn": "any"}, ["; any rotation, translations up to 0.5"]),
         ({"source": "stanford-scans"}, ["stanford-scans, 12 recorded pairs turned by up to 45°, 768 points per cloud"]),
     ],
 )
 def test_the_protocol_in_one_line(data, said):
-    line = protocol(dataclasses.replace(PRESETS["paper"](), data=DataConfig(**data)), 12)
+    line = protocol(dataclasses.replace(PRESETS["corrected"](), data=DataConfig(**data)), 12)
     assert all(text in line for text in said)
     assert "\n" not in line
 

@@ -20,7 +20,7 @@ from cmig_jax.models.networks import config_from_json
 
 PRETRAINED = Path(__file__).parents[1] / "pretrained" / "own-clouds.npz"
 """The network that comes with the package: the preset `own-clouds`, trained on generated objects alone."""
-PRETRAINED_SHA256 = "a8eb3a3bdbf9ea953e74e64fe6fcff7015d784b410ee75c7a8caa87bd422aa56"
+PRETRAINED_SHA256 = "90a3138ee8e439f6f64d89bd98edd36595eeace5ef8b08444fc17f53795bf58e"
 SUFFIX = ".npz"
 CONFIG, STEP = "config.json", "step"
 

@@ -218,6 +218,7 @@ class Needs:
         training_points: fewest points per cloud in training.
         pairs: fewest pairs per training step.
         views: whether it reads depth views.
+        axis_views: whether those must be the six along the axes, of each cloud.
         equal_sizes: whether both clouds must have the same number of points.
         normals: whether it reads unit normals of the points.
     """
@@ -226,6 +227,7 @@ class Needs:
     training_points: int = 3
     pairs: int = 1
     views: bool = False
+    axis_views: bool = False
     equal_sizes: bool = False
     normals: bool = False
 
@@ -338,6 +340,11 @@ class Config:
                     f"data.crop = {self.data.crop}",
                     not (equal and self.data.crop == "source"),
                     "another crop, since the network needs equal sizes",
+                ),
+                (
+                    f"views.of = {self.views.of}, views.layout = {self.views.layout}",
+                    not self.model.needs.axis_views or (self.views.of, self.views.layout) == ("both", "axes"),
+                    "both, and axes: the network asks where points fall in the views",
                 ),
                 (
                     f"data.frame = {self.data.frame} with views.of = {self.views.of}",

@@ -14,6 +14,7 @@ from cmig_jax.config import ComputeConfig, Config, DataConfig, OptimConfig, View
 from cmig_jax.config_json import differences, flat, to_json
 from cmig_jax.models.cmignet import flags as cmignet
 from cmig_jax.models.networks import config_from_json
+from cmig_jax.models.patches.flags import PatchFlags
 
 PAPER = Config(name="paper", model=cmignet.CMIGNetFlags())
 REFUSED_BY_GROUP = [
@@ -100,6 +101,7 @@ def test_every_rule_is_tested_above(monkeypatch):
         "model.fusion.image",
         "data.crop",
         "data.frame",
+        "views.of",
         "model.matching.head",
         *(f"model.keypoints.{x}" for x in ("select", "activation", "score_from")),
     }
@@ -130,6 +132,16 @@ def test_views_of_objects_are_in_the_objects_frames(frame):
         changed(PAPER, "data.frame", frame)
     observed = changed(changed(PAPER, "views.of", "both"), "data.frame", frame)
     assert observed.data.as_tested.frame == {"any": "any", "half": "object"}[frame]
+
+
+@pytest.mark.parametrize("image", ["pixels", "views"])
+def test_where_points_fall_is_known_in_views_of_both_clouds_along_the_axes(image):
+    views = ViewsConfig(of="both", count=6, layout="axes")
+    config = Config(name="mine", model=PatchFlags(image=image), views=views)
+    for other in (dataclasses.replace(views, of="source"), dataclasses.replace(views, layout="ring")):
+        with pytest.raises(ValueError, match=rf"views\.of = {other.of}, views\.layout = {other.layout}: expected both, and axes"):
+            dataclasses.replace(config, views=other)
+    assert dataclasses.replace(config, model=PatchFlags(), views=ViewsConfig()).model.needs.views is False
 
 
 def test_a_share_is_drawn_for_crops_of_both_clouds():

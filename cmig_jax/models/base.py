@@ -54,11 +54,11 @@ def initial_variables(module: nn.Module, needs: Needs, key: Array) -> dict[str, 
 
 def smallest_batch(needs: Needs) -> Batch:
     """Return the smallest training batch that a network accepts: its parameters depend on no number of pairs, points or pixels."""
-    points = max(needs.points, needs.training_points)
+    points, (sets, count) = max(needs.points, needs.training_points), (2, 6) if needs.axis_views else (1, 1)
     return Batch(
         source=jnp.zeros((1, points, 3)),
         target=jnp.zeros((1, points, 3)),
-        views=jnp.zeros((1, 1, 1, 32, 32, 1), jnp.uint8) if needs.views else None,
+        views=jnp.zeros((1, sets, count, 32, 32, 1), jnp.uint8) if needs.views else None,
         target_from_source=RigidTransform.identity((1,)),
         source_normals=jnp.zeros((1, points, 3)) if needs.normals else None,
         target_normals=jnp.zeros((1, points, 3)) if needs.normals else None,

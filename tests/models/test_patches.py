@@ -141,7 +141,7 @@ def test_the_losses(random_variables):
 
 
 def test_pairs_without_overlap_have_finite_losses_and_derivatives():
-    network, batch = PatchTransformer(TINY), pairs()
+    network, batch = PatchTransformer(dataclasses.replace(TINY, layers=1)), pairs()
     variables = initial_variables(network, TINY.needs, jax.random.key(0))
     apart = batch.replace(target=batch.target + 100)
 
@@ -199,7 +199,7 @@ def test_a_patch_has_the_features_of_the_pixels_that_show_its_centre():
 
 
 def test_it_learns():
-    flags = dataclasses.replace(TINY, patches=17, near=0.3)
+    flags = dataclasses.replace(TINY, layers=1, patches=17, near=0.3)
     network, rng = PatchTransformer(flags), np.random.default_rng(0)
     source = rng.normal(size=(4, 17, 3))
     truth = RigidTransform(R=Rotation.from_rotvec(rng.normal(size=(4, 3)) / 3).as_matrix(), t=rng.normal(size=(4, 3)))

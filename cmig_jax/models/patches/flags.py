@@ -65,4 +65,4 @@ class PatchFlags(ModelFlags):
     @property
     def needs(self) -> Needs:
         """The points of a patch, three patches for a pose, and maybe views."""
-        return Needs(points=max(3, self.k), training_points=max(3, self.k), views=self.image != "none")
+        return Needs(points=max(3, self.k), training_points=max(3, self.k), views=self.image != "none", axis_views=self.image != "none")

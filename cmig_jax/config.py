@@ -170,7 +170,7 @@ class DataConfig:
 
     @property
     def as_tested(self) -> DataConfig:
-        """The protocol of validation and test pairs."""
+        """The protocol of validation and test pairs, of which `frame=half` turns none."""
         return replace(self, frame="object") if self.frame == "half" else self
 
     @property

@@ -70,7 +70,7 @@ def _patch_rows() -> Iterator[tuple[str, Flags, Flags]]:
         if not flags:
             yield "the same, one pass", flags, {**VALIDATION, "model.passes": 1}
         if not flags or "data.frame" in flags:
-            yield f"{label}, tested in any", flags, {**VALIDATION, "data.frame": "any"}
+            yield f"{label}, tested in any frame", flags, {**VALIDATION, "data.frame": "any"}
 
 
 STARTS = Experiment(

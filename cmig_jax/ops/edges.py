@@ -14,7 +14,7 @@ from cmig_jax.ops.pooling import maximum
 
 
 def gather(x: Array, index: Array) -> Array:
-    """Return `[B, N, k, C]`, the rows of `x [B, M, C]` that `index [B, N, k]` names."""
+    """Return `[B, ..., C]`, the rows of `x [B, M, C]` that `index [B, ...]` names; of a graph, `[B, N, k]`."""
     return jax.vmap(lambda rows, i: rows[i])(x, index)
 
 

@@ -12,6 +12,7 @@ from cmig_jax.data.render import EXTENT, camera_frames
 from cmig_jax.geometry.distances import length
 from cmig_jax.nn.mlp import Dense
 from cmig_jax.nn.resnet import Convolution
+from cmig_jax.ops.edges import gather
 
 VIEWS = 6
 LAYOUT = "axes"
@@ -93,7 +94,7 @@ def project(points: Array, index: Array, size: int) -> tuple[Array, Array, Array
     """
     centred = points - jnp.mean(points, axis=1, keepdims=True)
     radius = jnp.max(length(centred), axis=1)[:, None, None]
-    chosen = jnp.take_along_axis(centred / jnp.where(radius > 0, radius, 1), index[..., None], axis=1)
+    chosen = gather(centred / jnp.where(radius > 0, radius, 1), index)
     frames = jnp.asarray(camera_frames(LAYOUT, VIEWS), points.dtype)
     right, up, depth = jnp.moveaxis(jnp.einsum("vij,bkj->bvki", frames, chosen, precision=HIGHEST), -1, 0)
     row, column = (jnp.clip((EXTENT + x) * size / (2 * EXTENT), 0, size - 1).astype(jnp.int32) for x in (-up, right))

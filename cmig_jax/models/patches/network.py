@@ -98,7 +98,7 @@ class PatchTransformer(nn.Module):
         The clouds are moved to their centroids first: what is left of a translation comes from the crops alone.
         """
         (x, f), (y, g) = (
-            (_rows(cloud, index), self.encoder(cloud - jnp.mean(cloud, axis=1, keepdims=True), index))
+            (gather(cloud, index), self.encoder(cloud - jnp.mean(cloud, axis=1, keepdims=True), index))
             for cloud, index in ((source, source_index), (target, target_index))
         )
         if images is not None and self.flags.image == "pixels":
@@ -136,7 +136,7 @@ class PatchEncoder(nn.Module):
     @nn.compact
     def __call__(self, points: Array, index: Array) -> Array:
         """Encode the patches around those of `points [B, N, 3]` that `index [B, K]` names, to `[B, K, dim]`."""
-        centre = _rows(points, index)
+        centre = gather(points, index)
         square = squared_distances(*jax.lax.stop_gradient((centre, points)))
         # With two axes: XLA's CPU compiler has no fast top-k of more.
         neighbours = top_k(-square.reshape(-1, square.shape[-1]), self.k).reshape(*index.shape, self.k)
@@ -169,11 +169,6 @@ class PairLayer(nn.Module):
         normed = self.norms[1](f), self.norms[1](g)
         f, g = f + self.cross(normed[0], normed[1]), g + self.cross(normed[1], normed[0])
         return f + self.hidden(self.norms[2](f)), g + self.hidden(self.norms[2](g))
-
-
-def _rows(points: Array, index: Array) -> Array:
-    """Return the points `[B, K, 3]` that `index [B, K]` names of `points [B, N, 3]`."""
-    return jnp.take_along_axis(points, index[..., None], axis=1)
 
 
 def _of_nearest(points: Array, centres: Array, values: Array) -> Array:

@@ -123,7 +123,7 @@ def test_twists_have_a_uniform_direction_and_a_uniform_length(longest):
 def logarithm(R, t):
     """Return the twist (w, v) of a pose: t = V v, with V the mean of the rotations by s w for s in [0, 1]."""
     w = Rotation.from_matrix(R).as_rotvec()
-    V = np.mean([Rotation.from_rotvec(s * w).as_matrix() for s in (np.arange(40) + 0.5) / 40], axis=0)
+    V = Rotation.from_rotvec(np.outer((np.arange(40) + 0.5) / 40, w)).as_matrix().mean(axis=0)
     return np.concatenate([w, np.linalg.solve(V, t)])
 
 

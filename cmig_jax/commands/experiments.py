@@ -166,4 +166,4 @@ def write(folder: Path, name: str, experiment: Experiment, results: Results) -> 
     write_text(folder / f"{name}.tex", table(experiment, results, "latex"))
     write_text(folder / f"{name}.json", json.dumps(as_json(name, experiment, results), indent=1) + "\n")
     if any(outcome.metrics for outcome in results.outcomes):
-        plot_rows(name, results, folder / f"{name}.png")
+        plot_rows(name, experiment, results, folder / f"{name}.png")

@@ -54,6 +54,7 @@ class Experiment:
         rows: the rows.
         baselines: whether methods without learning stand beside the rows.
         columns: metrics that its table shows, keys of columns of `evaluation.tables`.
+        drawn: the two of them that its picture shows.
     """
 
     about: str
@@ -61,6 +62,7 @@ class Experiment:
     rows: tuple[Row, ...]
     baselines: bool = False
     columns: tuple[str, ...] = ("rmse_r_deg", "mae_r_deg", "rmse_t", "mae_t", "recall", "seconds_per_pair")
+    drawn: tuple[str, str] = ("rmse_r_deg", "mae_r_deg")
 
 
 @dataclass(frozen=True)

@@ -1,6 +1,7 @@
 """The table of an experiment: mean and spread, quoted figures apart, empty rows empty."""
 
 import json
+from dataclasses import replace
 from pathlib import Path
 
 import pytest
@@ -9,6 +10,7 @@ from cmig_jax.experiments.figure import plot_rows
 from cmig_jax.experiments.plan import plan
 from cmig_jax.experiments.run import Outcome, Results
 from cmig_jax.experiments.table import as_json, notes, spread, table
+from cmig_jax.report.plots import save
 from configs.catalogue import catalogue
 from configs.experiments import EXPERIMENTS
 
@@ -75,6 +77,19 @@ def test_the_spread_of_one_value_is_zero():
     assert spread([1.0, 3.0]) == (2.0, pytest.approx(2**0.5))
 
 
-def test_the_figure_is_drawn(results, tmp_path):
-    plot_rows("table7", results, tmp_path / "table7.png")
+def test_the_figure_shows_the_metrics_that_the_experiment_names(results, tmp_path, monkeypatch):
+    drawn = []
+    monkeypatch.setattr("cmig_jax.experiments.figure.save", lambda figure, path: (drawn.append(figure), save(figure, path)))
+    for experiment in (TABLE7, replace(TABLE7, drawn=("recall", "mae_t"))):
+        plot_rows("table7", experiment, results, tmp_path / "table7.png")
     assert (tmp_path / "table7.png").stat().st_size > 5000
+    assert [[axes.get_xlabel() for axes in figure.axes] for figure in drawn] == [
+        ["RMSE(R), deg", "MAE(R), deg"],
+        ["recall, %", "MAE(t), units"],
+    ]
+    dots = [[line.get_xdata().tolist() for line in figure.axes[0].lines] for figure in drawn]
+    assert dots == [[[1, 3], [7.25]], [[50, 50], [50]]]
+
+
+def test_every_experiment_draws_metrics_of_its_table():
+    assert all(set(experiment.drawn) <= set(experiment.columns) for experiment in EXPERIMENTS.values())

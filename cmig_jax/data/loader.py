@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import signal
 from collections.abc import Sequence
 from typing import Any, Protocol
 
@@ -50,7 +51,7 @@ def training_batches(pairs: Pairs, config: Config, *, process: int = 0, processe
     if config.data.workers:
         if not flags.FLAGS.is_parsed():
             flags.FLAGS.mark_as_parsed()  # grain's workers read absl's flags, which no script of this package parses
-        stream = stream.mp_prefetch(grain.MultiprocessingOptions(num_workers=config.data.workers))
+        stream = stream.mp_prefetch(grain.MultiprocessingOptions(num_workers=config.data.workers), worker_init_fn=_ignore_interrupts)
     return iter(stream)
 
 
@@ -62,6 +63,12 @@ def epoch_steps(pairs: Pairs, config: Config) -> int:
 def stack(pairs: Sequence[Pair]) -> Pair:
     """Stack pairs of equal shapes into a batch `[B, ...]` of the arrays that training reads."""
     return {key: np.stack([pair[key] for pair in pairs]) for key in TRAINING_KEYS if key in pairs[0]}
+
+
+def _ignore_interrupts(worker: int, workers: int) -> None:
+    """Leave Ctrl-C, which a terminal sends to every process, to the training, which then stops its workers."""
+    del worker, workers
+    signal.signal(signal.SIGINT, signal.SIG_IGN)
 
 
 def _with_seed(position: int, rng: np.random.Generator) -> tuple[int, int]:

@@ -2,6 +2,9 @@
 
 import dataclasses
 import itertools
+import multiprocessing
+import os
+import signal
 from pathlib import Path
 
 import numpy as np
@@ -124,8 +127,12 @@ def test_pairs_without_views_stack_without_them():
     assert set(stack([pairs[0], pairs[1]])) == {"source", "target", "R", "t"}
 
 
-def test_worker_processes_make_the_same_batches(monkeypatch):
+def test_worker_processes_make_the_same_batches_and_leave_interrupts_to_the_training(monkeypatch):
     monkeypatch.syspath_prepend(Path(__file__).parents[2])  # where a worker finds the class above
     workers = dataclasses.replace(config(), data=dataclasses.replace(config().data, workers=1))
     stream = training_batches(PAIRS, workers)
-    assert_same([next(stream) for _ in range(3)], take(3))
+    batches = [next(stream)]
+    (worker,) = [child for child in multiprocessing.active_children() if "grain" in child.name]
+    os.kill(worker.pid, signal.SIGINT)
+    assert_same([*batches, *(next(stream) for _ in range(7))], take(8))
+    assert worker.is_alive()

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import multiprocessing
+import signal
 import sys
 import zlib
 from collections.abc import Iterator, Sequence
@@ -114,7 +115,7 @@ def _made(jobs: Sequence[Job], workers: int) -> Iterator[dict[str, Any]]:
     if workers == 1:
         yield from map(_row, jobs)
         return
-    with multiprocessing.get_context("spawn").Pool(workers) as pool:
+    with multiprocessing.get_context("spawn").Pool(workers, signal.signal, (signal.SIGINT, signal.SIG_IGN)) as pool:  # Ctrl-C ends this one
         yield from pool.imap(_row, jobs)
 
 

@@ -41,6 +41,7 @@ WIDER = tuple(
     Column(f"recall_{angle}_deg", f"within {angle} deg, {distance:g}", "%", 1, 100.0, "high") for angle, distance in WIDER_RECALLS.items()
 )
 """For experiments that ask for starts of a refinement."""
+BY_KEY = {column.key: column for column in (*COLUMNS, *WIDER)}
 
 
 def text_table(results: Mapping[str, Any]) -> str:

@@ -6,7 +6,7 @@ from pathlib import Path
 
 from matplotlib.figure import Figure
 
-from cmig_jax.evaluation.tables import COLUMNS, WIDER
+from cmig_jax.evaluation.tables import BY_KEY
 from cmig_jax.experiments.run import Results
 from cmig_jax.experiments.schema import Experiment
 from cmig_jax.experiments.table import spread
@@ -25,9 +25,8 @@ def plot_rows(name: str, experiment: Experiment, results: Results, path: Path) -
     """
     labels = list(dict.fromkeys(outcome.job.row.label for outcome in results.outcomes if outcome.metrics))
     figure = Figure(figsize=(8.5, 1.1 + 0.34 * len(labels)), layout="constrained")
-    columns = {column.key: column for column in (*COLUMNS, *WIDER)}
     for axes, key, colour in zip(figure.subplots(1, 2, sharey=True), experiment.drawn, (TARGET, SOURCE), strict=True):
-        column = columns[key]
+        column = BY_KEY[key]
         for height, label in enumerate(labels):
             values = [o.metrics[key] * column.factor for o in results.outcomes if o.metrics and o.job.row.label == label]
             axes.plot(values, [height] * len(values), "o", color=colour, markersize=5, alpha=0.75, clip_on=False)

@@ -7,7 +7,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import asdict
 from typing import Any
 
-from cmig_jax.evaluation.tables import COLUMNS, WIDER, Column, latex_rows, latex_text, markdown_rows, text_rows
+from cmig_jax.evaluation.tables import BY_KEY, COLUMNS, Column, latex_rows, latex_text, markdown_rows, text_rows
 from cmig_jax.experiments.run import Outcome, Results
 from cmig_jax.experiments.schema import Experiment, Row
 
@@ -23,8 +23,7 @@ def table(experiment: Experiment, results: Results, style: str = "text") -> str:
         results: of its jobs.
         style: `text` for a terminal, `markdown`, or `latex` (package booktabs).
     """
-    known = {column.key: column for column in (*COLUMNS, *WIDER)}
-    shown = [known[key] for key in experiment.columns]
+    shown = [BY_KEY[key] for key in experiment.columns]
     rows = [[name, "", *(_cell(column, [metrics]) for column in shown)] for name, metrics in results.baselines.items()]
     rows += [_row(row, [o for o in results.outcomes if o.job.row is row], shown) for row in experiment.rows]
     quoted = any(row.quoted for row in experiment.rows)
